@@ -1,0 +1,57 @@
+"""`Arm`: a serial arm with names, units, limits and the physics its model already holds."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxpanda_kernels import Chain, rnea
+from jaxtyping import Array, Float
+
+
+class Arm(eqx.Module):
+    """A serial arm: the numeric `Chain`, its nominal parameters, and what to call its parts.
+
+    Everything rigidly fixed to a link (tool, gripper, locked fingers) is lumped into that link.
+    """
+
+    chain: Chain
+    standard: Float[Array, "dof 10"]
+    """Nominal inertial parameters, order and units as in `jaxpanda_kernels.inertia`."""
+    armature: Float[Array, " dof"]
+    """Reflected rotor inertia [kg m²]."""
+    damping: Float[Array, " dof"]
+    """Viscous friction that the model already holds [N m s/rad]."""
+    frictionloss: Float[Array, " dof"]
+    """Coulomb friction that the model already holds [N m]."""
+    stiffness: Float[Array, " dof"]
+    """Joint springs that the model already holds [N m/rad]."""
+    springref: Float[Array, " dof"]
+    """Where those springs rest [rad]."""
+    lower: Float[Array, " dof"]
+    """Joint limits [rad]; infinite where there are none."""
+    upper: Float[Array, " dof"]
+    joint_names: tuple[str, ...] = eqx.field(static=True)
+    link_names: tuple[str, ...] = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    @property
+    def dof(self) -> int:
+        return self.chain.dof
+
+    def known_torque(
+        self, q: Float[Array, " dof"], qd: Float[Array, " dof"], qdd: Float[Array, " dof"]
+    ) -> Float[Array, " dof"]:
+        r"""Torque [N m] of what the model holds beyond rigid links.
+
+        $I_a \ddot q + F_v \dot q + F_c\,\mathrm{sign}(\dot q) + k\,(q - q_0)$
+        """
+        return (
+            self.armature * qdd
+            + self.damping * qd
+            + self.frictionloss * jnp.sign(qd)
+            + self.stiffness * (q - self.springref)
+        )
+
+    def inverse_dynamics(
+        self, q: Float[Array, " dof"], qd: Float[Array, " dof"], qdd: Float[Array, " dof"]
+    ) -> Float[Array, " dof"]:
+        """Joint torque [N m] of a motion under the model as it is."""
+        return rnea(self.chain, self.standard, q, qd, qdd) + self.known_torque(q, qd, qdd)
