@@ -1,5 +1,7 @@
 """`Arm`: a serial arm with names, units, limits and the physics its model already holds."""
 
+from pathlib import Path
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxpanda_kernels import Chain, rnea
@@ -31,6 +33,17 @@ class Arm(eqx.Module):
     joint_names: tuple[str, ...] = eqx.field(static=True)
     link_names: tuple[str, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
+
+    @classmethod
+    def from_mjcf(cls, path: str | Path) -> "Arm":
+        """The serial arm in a user's MJCF; `jaxpanda.mjcf` says what can be represented.
+
+        Raises:
+            InputError: the file is no MJCF, or holds something that a serial arm cannot represent.
+        """
+        from .mjcf import from_mjcf
+
+        return from_mjcf(path)[0]
 
     @property
     def dof(self) -> int:

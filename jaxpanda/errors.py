@@ -13,3 +13,11 @@ class MissingExtraError(InputError):
 
     def __init__(self, what: str, extra: str):
         super().__init__(f"{what} needs the extra [{extra}]: pip install 'jaxpanda[{extra}]'")
+
+
+def require_x64(stage: str) -> None:
+    """Refuse float32 where ranks are decided."""
+    import jax
+
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(f"{stage} needs float64: call jax.config.update('jax_enable_x64', True) first")
