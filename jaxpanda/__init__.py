@@ -1,0 +1,67 @@
+"""From recordings of a robot arm to a model that could be built, one function a stage.
+
+    recording = jaxpanda.load("arm.csv")
+    found = jaxpanda.identify([recording], jaxpanda.Arm.panda())
+    links = jaxpanda.retrieve(found)
+    jaxpanda.to_mjcf(links, "arm.xml")
+    jaxpanda.validate("arm.xml", [recording])
+
+The names below are read from their modules when first used, so that `import jaxpanda` stays light; nothing
+here switches on float64, which identification needs (`jax.config.update("jax_enable_x64", True)`).
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+
+if TYPE_CHECKING:
+    from .arm import Arm as Arm
+    from .demo import demonstrate as demonstrate
+    from .errors import InputError as InputError
+    from .export import to_mjcf as to_mjcf
+    from .feasible import Bounds as Bounds
+    from .identification import Identification as Identification
+    from .identification import identify as identify
+    from .identification import identify_mass_gravity as identify_mass_gravity
+    from .inspection import inspect as inspect
+    from .recordings import Recording as Recording
+    from .recordings import load as load
+    from .recordings import save as save
+    from .retrieval import Retrieval as Retrieval
+    from .retrieval import retrieve as retrieve
+    from .signals import prepare as prepare
+    from .simulation import simulate as simulate
+    from .validation import validate as validate
+
+_HOME = {
+    "Arm": "arm",
+    "Bounds": "feasible",
+    "Identification": "identification",
+    "InputError": "errors",
+    "Recording": "recordings",
+    "Retrieval": "retrieval",
+    "demonstrate": "demo",
+    "identify": "identification",
+    "identify_mass_gravity": "identification",
+    "inspect": "inspection",
+    "load": "recordings",
+    "prepare": "signals",
+    "retrieve": "retrieval",
+    "save": "recordings",
+    "simulate": "simulation",
+    "to_mjcf": "export",
+    "validate": "validation",
+}
+__all__ = [*_HOME]  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'jaxpanda' has no attribute {name!r}; it has {', '.join(_HOME)}")
+    value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(_HOME)

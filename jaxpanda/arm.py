@@ -45,6 +45,13 @@ class Arm(eqx.Module):
 
         return from_mjcf(path)[0]
 
+    @classmethod
+    def panda(cls) -> "Arm":
+        """The Franka Emika Panda, from published numbers; `jaxpanda.panda` says which."""
+        from .panda import panda
+
+        return panda()
+
     @property
     def dof(self) -> int:
         return self.chain.dof

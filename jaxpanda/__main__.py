@@ -1,0 +1,212 @@
+"""The command `jaxpanda`: tyro over one dataclass a stage.
+
+JAX takes seconds to import, so this module and `jaxpanda --help` do without; each command imports what it
+needs when it runs.
+"""
+
+import contextlib
+import dataclasses
+import io
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from .errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """The whole chain: identify, retrieve, export, validate; on its own virtual recording, or on yours."""
+
+    out: Path
+    """Folder for panda.xml, report.html and what the other commands leave."""
+    recording: tuple[Path, ...] = ()
+    """Recordings (CSV, .npz, .parquet or a folder of raw logs); without any, a virtual Panda is recorded."""
+    model: Path | None = None
+    """The simulation as you have it (MJCF); without it, the project's own Panda."""
+    starts: int = 1024
+    """Random starts of the retrieval."""
+    seed: int = 0
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from .demo import demonstrate
+
+        return demonstrate(self.out, recordings=self.recording, model=self.model, starts=self.starts, seed=self.seed)
+
+
+@dataclasses.dataclass(frozen=True)
+class Inspect:
+    """What is in a recording: channels, rate, gaps, units, signs, noise, and what it can identify."""
+
+    recording: tuple[Path, ...]
+    """Recordings to look at."""
+    model: Path | None = None
+    """The arm (MJCF); without it, the project's own Panda."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import pipeline
+
+        return pipeline.inspect_files(self.recording, self.model)
+
+
+@dataclasses.dataclass(frozen=True)
+class Identify:
+    """Base parameters and friction, from recordings or from samples of M(q), g(q)."""
+
+    out: Path
+    """Folder for identification.json."""
+    recording: tuple[Path, ...] = ()
+    """Recordings with torque."""
+    mass_gravity: Path | None = None
+    """Table of M(q), g(q) instead of recordings: .npz with q (N, n), M (N, n, n), g (N, n)."""
+    model: Path | None = None
+    """The arm (MJCF); without it, the project's own Panda."""
+    method: Literal["trajectory", "one_step"] = "trajectory"
+    """Classical least squares, or feasible parameters straight from torque."""
+    friction: Literal["coulomb_viscous_offset", "coulomb_viscous", "viscous", "sigmoid", "none"] = (
+        "coulomb_viscous_offset"
+    )
+    weighting: Literal["joint", "none"] = "joint"
+    """Weigh each joint by its residual, or all alike."""
+    cutoff: float = 5.0
+    """Of the zero-phase low-pass on regressor and torque alike [Hz]."""
+    folds: int = 5
+    """Of the phase-blocked cross-validation."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import pipeline
+
+        return pipeline.identify_files(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Retrieve:
+    """Physically feasible link parameters behind identified coefficients, from many random starts."""
+
+    identification: Path
+    """identification.json, or a table of coefficients with the same fields."""
+    out: Path
+    """Folder for retrieval.json and starts.npz."""
+    starts: int = 1024
+    """Random starts."""
+    seed: int = 0
+    bounds: Path | None = None
+    """CSV with name, lower, upper for each link parameter; without it, the published bounds of the Panda."""
+    model: Path | None = None
+    """The arm (MJCF) that bounds are set around when it is not the Panda and --bounds is absent."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import pipeline
+
+        return pipeline.retrieve_files(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write retrieved parameters into an MJCF, touching only what changes."""
+
+    retrieval: Path
+    """Folder that `retrieve` wrote."""
+    out: Path
+    """The MJCF to write; a .urdf suffix writes URDF instead."""
+    model: Path | None = None
+    """Your MJCF, kept as it is but for the parameters; without it, the project's own Panda."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import pipeline
+
+        return pipeline.export_files(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Validate:
+    """Check an MJCF in MuJoCo and MJX, and against recordings."""
+
+    model: Path
+    """The MJCF to check."""
+    recording: tuple[Path, ...]
+    """Recordings with torque."""
+    out: Path
+    """Folder for validation.json."""
+    cutoff: float = 5.0
+    """Of the zero-phase low-pass on both torques [Hz]."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import pipeline
+
+        return pipeline.validate_files(self)
+
+
+_COMMANDS = (Demo, Inspect, Identify, Retrieve, Export, Validate)
+
+
+def _parse(arguments: list[str]) -> Any:
+    """The command that the arguments spell; bad usage ends in one line and status 2."""
+    union: Any = None
+    for command in _COMMANDS:
+        spelled = Annotated[command, tyro.conf.subcommand(command.__name__.lower())]
+        union = spelled if union is None else union | spelled
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(
+                union,
+                prog="jaxpanda",
+                description="From recordings of a robot arm to a model that could be built.",
+                args=arguments,
+                config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes),
+            )
+    except SystemExit as stop:
+        if stop.code:
+            raise InputError(_one_line(complaint.getvalue())) from None
+        raise
+
+
+def _one_line(panel: str) -> str:
+    """A framed complaint of tyro's as one sentence."""
+    words = " ".join(line.strip("╭╮╰╯│─ ") for line in panel.splitlines())
+    words = words.replace("•", " ").replace("For full helptext, run:", "; see").replace("For full helptext, run", "; see")
+    return " ".join(words.split()).replace(" ;", ";")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit status that docs and INTERFACE promise."""
+    try:
+        command = _parse(sys.argv[1:] if arguments is None else arguments)
+        from . import session
+
+        session.start()
+        result = command.run()
+        if command.json:
+            from .files import to_json
+
+            sys.stdout.write(to_json(result.to_json()))
+        else:
+            from . import report, summaries
+
+            report.to_terminal(summaries.of(result))
+    except InputError as error:
+        print(f"jaxpanda: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("jaxpanda: interrupted; nothing was left half-written", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,92 @@
+"""Results as sections of text, tables and figures: on a terminal, and as one self-contained page.
+
+A stage's summary is written once, as `Section`s (`jaxpanda.summaries`); `to_terminal` and `to_html` are the two
+ways to read it. The page needs no network: figures are SVG inside it.
+"""
+
+import dataclasses
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from .files import write_text
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Rows of ready-made text under column heads; the first column names the row."""
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A figure drawn when it is needed: `draw` gets a matplotlib figure of `size` [inches]."""
+
+    draw: Callable
+    caption: str
+    size: tuple[float, float] = (9.0, 5.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """A heading with sentences, tables and figures."""
+
+    heading: str
+    sentences: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    figures: Sequence[Figure] = ()
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number as people read it; a dash where there is none."""
+    return "–" if value is None else f"{value:.{digits}g}"
+
+
+def to_terminal(sections: Sequence[Section]) -> None:
+    """Print sections on standard output, without their figures."""
+    import rich.table
+    from rich.console import Console
+    from rich.markup import escape
+
+    console = Console(highlight=False)
+    for section in sections:
+        console.print(f"\n[bold]{escape(section.heading)}[/bold]")
+        for sentence in section.sentences:
+            console.print(escape(sentence), soft_wrap=True)
+        for table in section.tables:
+            drawn = rich.table.Table(title=escape(table.caption) or None, title_justify="left")
+            for i, column in enumerate(table.columns):
+                drawn.add_column(escape(column), justify="left" if i == 0 else "right")
+            for row in table.rows:
+                drawn.add_row(*(escape(cell) for cell in row))
+            console.print(drawn)
+
+
+def to_html(title: str, sections: Sequence[Section], path: str | Path) -> None:
+    """Write sections as one self-contained page."""
+    import jinja2
+
+    pages = jinja2.Environment(
+        loader=jinja2.PackageLoader("jaxpanda"), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    drawn = [(section, [(_svg(figure), figure.caption) for figure in section.figures]) for section in sections]
+    write_text(path, pages.get_template("report.html.j2").render(title=title, sections=drawn))
+
+
+def _svg(figure: Figure) -> str:
+    """The figure as an SVG element; drawn without pyplot, so no global state and no display."""
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure as Canvas
+
+    style = {"svg.fonttype": "none", "font.size": 8, "axes.grid": True, "grid.alpha": 0.3, "lines.linewidth": 0.9}
+    with matplotlib.rc_context(style):
+        canvas = Canvas(figsize=figure.size, layout="constrained")
+        FigureCanvasSVG(canvas)
+        figure.draw(canvas)
+        buffer = io.StringIO()
+        canvas.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue().partition("<svg")[1] + buffer.getvalue().partition("<svg")[2]
