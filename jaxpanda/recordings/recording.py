@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..errors import InputError
+
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
@@ -28,6 +30,8 @@ class Recording:
     path: Path | None = None
     repairs: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """How many rows or values reading dropped, filled or moved, by what was done; empty if none."""
+    notes: tuple[str, ...] = ()
+    """What else reading found out, and the evidence for the repairs, in plain words."""
 
     @property
     def dof(self) -> int:
@@ -36,3 +40,28 @@ class Recording:
     @property
     def samples(self) -> int:
         return len(self.time)
+
+    @property
+    def rate(self) -> float:
+        """Sample rate [Hz]: the inverse of the median step."""
+        return 1 / float(np.median(np.diff(self.time)))
+
+    def channels(self) -> list[Float[np.ndarray, "time dof"]]:
+        """q, and qd and tau where they were measured."""
+        return [channel for channel in (self.q, self.qd, self.tau) if channel is not None]
+
+    def require_dof(self, dof: int) -> None:
+        """Refuse a recording of an arm with another number of joints."""
+        if self.dof != dof:
+            raise InputError(
+                f"{self.name}: {self.dof} joints (columns q_1 ... q_{self.dof}), where the model has {dof}: "
+                "give the model of the recorded arm"
+            )
+
+    def require_tau(self) -> Float[np.ndarray, "time dof"]:
+        """The measured torque; refuse a motion."""
+        if self.tau is None:
+            raise InputError(
+                f"{self.name}: no columns tau_1 ... tau_{self.dof}: this needs measured joint torques, not a motion"
+            )
+        return self.tau

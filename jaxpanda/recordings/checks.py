@@ -1,0 +1,142 @@
+"""What every format's rows must satisfy before they become a `Recording`."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..errors import InputError
+from .recording import Recording
+
+
+RATES = (50.0, 4000.0)
+"""Sample rates that occur [Hz]."""
+SHORTEST = 0.25
+"""Nothing can be said about a motion shorter than this [s]."""
+_MARGIN = 1.1  # on `RATES`: a nominal 50 Hz log may run at 48
+_TURN = 2 * np.pi
+
+
+def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Recording:
+    """The same recording, once its numbers are finite, ordered, long enough and in SI units.
+
+    Args:
+        recording: as read.
+        row: how the file counts sample `i` (0-based), for messages.
+
+    Raises:
+        InputError: naming file, column and row, and what would work.
+    """
+    row = row or (lambda i: f"row {i + 1}")
+    _finite(recording, row)
+    _ordered(recording, row)
+    _rate(recording)
+    _long_enough(recording)
+    _radians(recording)
+    _velocity_unit(recording)
+    return recording
+
+
+def _columns(recording: Recording):
+    """Each column with the name that the canonical CSV gives it."""
+    yield "time", recording.time
+    for name, channel in (("q", recording.q), ("dq", recording.qd), ("tau", recording.tau)):
+        if channel is not None:
+            for j in range(channel.shape[1]):
+                yield f"{name}_{j + 1}", channel[:, j]
+
+
+def _finite(recording: Recording, row: Callable[[int], str]) -> None:
+    for name, column in _columns(recording):
+        bad = np.flatnonzero(~np.isfinite(column))
+        if bad.size:
+            more = f" and {bad.size - 1} more below it" if bad.size > 1 else ""
+            raise InputError(
+                f"{recording.name}: column {name}, {row(bad[0])}: the value is {column[bad[0]]}{more}, where a "
+                "finite number is needed; leave out the rows that were not measured"
+            )
+
+
+def _ordered(recording: Recording, row: Callable[[int], str]) -> None:
+    back = np.flatnonzero(np.diff(recording.time) <= 0)
+    if back.size:
+        i = back[0] + 1
+        before, after = float(recording.time[i - 1]), float(recording.time[i])
+        what = "repeats" if before == after else "goes back"
+        raise InputError(
+            f"{recording.name}: column time, {row(i)}: time {what} ({before!r} s, then {after!r} s; {back.size} "
+            "such rows), where it must increase; sort the rows, drop repeated ones, or split the file into its runs"
+        )
+
+
+def _rate(recording: Recording) -> None:
+    if recording.samples < 2:
+        return
+    step = float(np.median(np.diff(recording.time)))
+    fastest, slowest = 1 / (RATES[1] * _MARGIN), _MARGIN / RATES[0]
+    if fastest <= step <= slowest:
+        return
+    for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+        if fastest <= step / factor <= slowest:
+            raise InputError(
+                f"{recording.name}: column time looks like {unit} (its median step is {step:g}), where seconds "
+                f"are needed: divide it by {factor:g}"
+            )
+    raise InputError(
+        f"{recording.name}: column time has a median step of {step:g} s ({1 / step:g} Hz), where sample rates from "
+        f"{RATES[0]:g} Hz to {RATES[1]:g} Hz in seconds can be used: check its unit, or record at such a rate"
+    )
+
+
+def _long_enough(recording: Recording) -> None:
+    duration = recording.time[-1] - recording.time[0] if recording.samples else 0.0
+    if duration < SHORTEST:
+        raise InputError(
+            f"{recording.name}: too short, {recording.samples} row{'s' * (recording.samples != 1)} over {duration:g} s, "
+            f"where at least {SHORTEST} s are needed (a few seconds of motion to filter it, ten or more to identify)"
+        )
+
+
+def _radians(recording: Recording) -> None:
+    """Joints turn a few times at most: two joints beyond two turns, or one beyond four, are degrees."""
+    furthest = np.max(np.abs(recording.q), axis=0)
+    if np.sum(furthest > 2 * _TURN) >= 2 or np.any(furthest > 4 * _TURN):
+        j = int(np.argmax(furthest))
+        row = int(np.argmax(np.abs(recording.q[:, j])))
+        raise InputError(
+            f"{recording.name}: column q_{j + 1} reaches {recording.q[row, j]:g} at {recording.time[row]:g} s, which "
+            "looks like degrees where radians are needed: multiply positions (and velocities) by pi/180"
+        )
+
+
+def _velocity_unit(recording: Recording) -> None:
+    """dq = k d(q)/dt with k near a conversion factor is a wrong unit of one of the two."""
+    k = velocity_scale(recording)
+    if k is None:
+        return
+    for factor, cure in (
+        (180 / np.pi, "dq looks like degrees per second: multiply it by pi/180"),
+        (np.pi / 180, "q looks like degrees beside dq in rad/s: multiply q by pi/180"),
+        (1e3, "dq is a thousand times d(q)/dt: check the units of time and dq"),
+        (1e-3, "dq is a thousandth of d(q)/dt: check the units of time and dq"),
+    ):
+        if abs(k / factor - 1) < 0.1:
+            raise InputError(
+                f"{recording.name}: columns dq_1 ... dq_{recording.dof} are {k:.3g} times d(q)/dt: {cure}"
+            )
+
+
+def velocity_scale(recording: Recording) -> float | None:
+    """k of the least-squares fit dq = k d(q)/dt over 20 ms; None where it is not defined or explains little."""
+    if recording.qd is None:
+        return None
+    half = max(1, round(0.01 / float(np.median(np.diff(recording.time)))))
+    if recording.samples < 4 * half + 4:
+        return None
+    dt = recording.time[2 * half :] - recording.time[: -2 * half]
+    slope = (recording.q[2 * half :] - recording.q[: -2 * half]) / dt[:, None]
+    qd = recording.qd[half:-half]
+    if not (np.any(slope) and np.any(qd)):
+        return None
+    k = np.sum(slope * qd) / np.sum(slope**2)
+    correlation = np.sum(slope * qd) / np.sqrt(np.sum(slope**2) * np.sum(qd**2))
+    return float(k) if abs(correlation) > 0.8 else None

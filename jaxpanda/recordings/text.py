@@ -1,0 +1,88 @@
+"""Bytes of a text file, plain or gzipped, into numbers, with the place of whatever is none."""
+
+import gzip
+import zlib
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import InputError
+
+
+def read_text(path: Path) -> str:
+    """The file's text without a byte-order mark; `.gz` is decompressed.
+
+    Raises:
+        InputError: the file is missing, unreadable, a broken gzip file, empty, or no text.
+    """
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if path.suffix == ".gz":
+        try:
+            content = gzip.decompress(content)
+        except (OSError, EOFError, zlib.error) as error:
+            raise InputError(
+                f"{path.name}: a broken or truncated gzip file ({error}): copy it again"
+            ) from None
+    if not content.strip():
+        raise InputError(f"{path.name}: the file is empty")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path.name}: no text (byte {error.start} is not UTF-8): save the recording as UTF-8 CSV"
+        ) from None
+    if "\0" in text:
+        raise InputError(f"{path.name}: binary data, no text: save the recording as UTF-8 CSV")
+    return text
+
+
+def numbers(
+    lines: list[str], name: str, delimiter: str | None, columns: list[str], first_line: int
+) -> Float[np.ndarray, "row column"]:
+    """A table of numbers; every line has as many cells as `columns` has names.
+
+    Args:
+        lines: the data lines, without a header; blank lines are skipped.
+        name: the file's name, for messages.
+        delimiter: between cells; None for blanks and tabs.
+        columns: the columns' names, for messages.
+        first_line: number of `lines[0]` in the file, 1-based.
+
+    Raises:
+        InputError: naming the first ragged line or the first cell that is no number.
+    """
+    try:
+        table = np.loadtxt(lines, dtype=float, delimiter=delimiter, comments=None, ndmin=2)
+    except ValueError:
+        table = None
+    if table is not None and table.shape[1] == len(columns):
+        return table
+    raise InputError(f"{name}: {_first_fault(lines, delimiter, columns, first_line)}")
+
+
+def _first_fault(lines: list[str], delimiter: str | None, columns: list[str], first_line: int) -> str:
+    row = 0
+    for number, line in enumerate(lines, first_line):
+        if not line.strip():
+            continue
+        row += 1
+        where = f"row {row} (line {number})"
+        cells = line.split(delimiter)
+        if len(cells) != len(columns):
+            return (
+                f"{where} has {len(cells)} cell{'s' * (len(cells) != 1)}, where the columns are {len(columns)} "
+                f"({columns[0]} ... {columns[-1]}): every row must have as many cells as there are columns"
+            )
+        for column, cell in zip(columns, cells, strict=True):
+            try:
+                float(cell)
+            except ValueError:
+                what = f"{cell.strip()[:40]!r} is no number" if cell.strip() else "the cell is empty"
+                return f"column {column}, {where}: {what}; every cell must hold one, with a decimal point"
+    return "the rows cannot be read as numbers"
