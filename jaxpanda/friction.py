@@ -9,7 +9,8 @@ r"""Friction of the joints as functions of velocity.
 | `sigmoid` | $\varphi_1\,(\sigma(\varphi_2(\dot q + \varphi_3)) - \sigma(\varphi_2\varphi_3))$ |
 
 with $\sigma(x) = 1/(1 + e^{-x})$. The sigmoid is eq. 25 of Gaz et al. 2019: its offset is tied, so that the
-torque is zero at rest. Friction is part of the joint torque that inverse dynamics must reproduce, hence positive where the velocity is.
+torque is zero at rest. Friction is part of the joint torque that inverse dynamics must reproduce, hence
+positive where the velocity is.
 """
 
 import dataclasses
