@@ -1,0 +1,218 @@
+"""XML as its author wrote it: where every tag stands, and edits that touch nothing else.
+
+A parser that writes its tree back loses comments, line breaks or digits. Here the text stays what it is:
+elements know the bytes of their start tag, and an edit replaces some of them.
+"""
+
+import dataclasses
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from xml.parsers import expat
+from xml.sax.saxutils import escape
+
+from .errors import InputError
+
+
+_ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
+_TAG = re.compile(rb"""<[^\s/>]+(?:"[^"]*"|'[^']*'|[^"'>])*>""")
+_GAP = re.compile(rb"\s*")
+_QUOTES = {'"': "&quot;", "'": "&apos;"}
+_COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
+
+
+@dataclasses.dataclass(eq=False)
+class Element:
+    """An element of a file: its tag, attributes, and the bytes `start:stop` of its start tag."""
+
+    source: str
+    """Name of its text in the document."""
+    file: Path
+    line: int
+    tag: str
+    attributes: dict[str, str]
+    start: int
+    stop: int
+    parent: "Element | None" = None
+    children: list["Element"] = dataclasses.field(default_factory=list)
+
+    def walk(self) -> Iterator["Element"]:
+        """The element and all below it, in the order of the text."""
+        yield self
+        for child in self.children:
+            yield from child.walk()
+
+    def has_ancestor(self, tag: str) -> bool:
+        return self.parent is not None and (self.parent.tag == tag or self.parent.has_ancestor(tag))
+
+
+@dataclasses.dataclass(frozen=True)
+class Edit:
+    """What to do to one element: attributes to set (None removes one), and a child to put in first."""
+
+    element: Element
+    attributes: Mapping[str, str | None] = dataclasses.field(default_factory=dict)
+    first_child: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Document:
+    """A file and what it includes, as text and as one tree with the included elements in their place."""
+
+    path: Path
+    texts: Mapping[str, str]
+    """Text by the name the file is included by; the main file under ''."""
+    root: Element
+
+    @property
+    def text(self) -> str:
+        return self.texts[""]
+
+    @property
+    def includes(self) -> dict[str, bytes]:
+        return {name: text.encode() for name, text in self.texts.items() if name}
+
+
+def read(path: str | Path, root: str) -> Document:
+    """The file and everything that it includes.
+
+    Raises:
+        InputError: a file cannot be read, is no well-formed XML, or the first element is no `root`.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    return parse(_decode(data, path), root, path)
+
+
+def parse(text: str, root: str, path: Path, known: Mapping[str, str] | None = None) -> Document:
+    """The document with this text; what it includes comes from `known` or else from beside `path`."""
+    tree = _tree(text, path)
+    if tree.tag != root:
+        raise InputError(f"{path}: line {tree.line}: starts with <{tree.tag}>, where <{root}> is expected")
+    texts = {"": text}
+    _include(tree, path, known or {}, texts)
+    return Document(path, texts, tree)
+
+
+def edit(document: Document, edits: Iterable[Edit]) -> Document:
+    """The document with these edits, every other byte as it was."""
+    texts = dict(document.texts)
+    data = {name: text.encode() for name, text in texts.items()}
+    replacements: dict[str, list[tuple[int, int, bytes]]] = {}
+    for e in edits:
+        name = e.element.source
+        replacements.setdefault(name, []).extend(_replacements(data[name], e))
+    for name, parts in replacements.items():
+        for start, stop, new in sorted(parts, reverse=True):
+            data[name] = data[name][:start] + new + data[name][stop:]
+        texts[name] = data[name].decode()
+    return parse(texts[""], document.root.tag, document.path, {k: v for k, v in texts.items() if k})
+
+
+def _decode(data: bytes, path: Path) -> str:
+    if not data.strip():
+        raise InputError(f"{path}: is empty")
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: byte {error.start + 1} is not UTF-8 text, so it cannot be MJCF") from None
+    if "\0" in text:
+        raise InputError(f"{path}: byte {data.index(0) + 1} is zero: a binary file, so it cannot be MJCF")
+    return text
+
+
+def _blank(comment: re.Match[bytes]) -> bytes:
+    return re.sub(rb"[^\r\n]", b" ", comment[0])
+
+
+def _tree(text: str, path: Path, source: str = "") -> Element:
+    # Comments are blanked first: MuJoCo's parser takes '--' inside them, the standard's does not.
+    data = _COMMENT.sub(_blank, text.encode())
+    open_elements: list[Element] = []
+    roots: list[Element] = []
+    parser = expat.ParserCreate("utf-8")
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        at = parser.CurrentByteIndex
+        match = _TAG.match(data, at)
+        if match is None:
+            raise InputError(f"{path}: line {parser.CurrentLineNumber}: <{tag}> comes from an entity")
+        parent = open_elements[-1] if open_elements else None
+        element = Element(source, path, parser.CurrentLineNumber, tag, attributes, at, match.end(), parent)
+        (parent.children if parent else roots).append(element)
+        open_elements.append(element)
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda tag: open_elements.pop()
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        reason = expat.ErrorString(error.code)
+        raise InputError(
+            f"{path}: line {error.lineno}, column {error.offset + 1}: {reason}; well-formed XML is expected"
+        ) from None
+    return roots[0]
+
+
+def _resolve(path: Path, name: str, includer: Path) -> Path:
+    """Where MuJoCo looks for an included file: beside the model, else beside the file that includes it."""
+    beside = path.parent / name
+    return beside if beside.exists() else includer.parent / name
+
+
+def _include(tree: Element, path: Path, known: Mapping[str, str], texts: dict[str, str]) -> None:
+    """Put the children of every included file where its `include` stands."""
+    children = []
+    for child in tree.children:
+        if child.tag != "include":
+            _include(child, path, known, texts)
+            children.append(child)
+            continue
+        name = child.attributes.get("file", "")
+        file = _resolve(path, name, child.file)
+        where = f"{child.file}: line {child.line}"
+        if name in texts:
+            raise InputError(f"{where}: includes {name!r} a second time, which MuJoCo refuses")
+        if name in known:
+            texts[name] = known[name]
+        else:
+            try:
+                texts[name] = _decode(file.read_bytes(), file)
+            except OSError as error:
+                raise InputError(
+                    f"{where}: includes {name!r}, which cannot be read ({error.strerror})"
+                ) from None
+        included = _tree(texts[name], file, name)
+        _include(included, path, known, texts)
+        for element in included.children:
+            element.parent = tree
+            children.append(element)
+    tree.children[:] = children
+
+
+def _replacements(data: bytes, e: Edit) -> Iterator[tuple[int, int, bytes]]:
+    start, stop = e.element.start, e.element.stop
+    spans = {m[1].decode(): m for m in _ATTRIBUTE.finditer(data, start, stop)}
+    end = max((m.end() for m in spans.values()), default=start + 1 + len(e.element.tag.encode()))
+    added = ""
+    for name, value in e.attributes.items():
+        if name not in spans:
+            added += f' {name}="{escape(value, _QUOTES)}"' if value is not None else ""
+        elif value is None:
+            yield spans[name].start(), spans[name].end(), b""
+        else:
+            yield spans[name].start(2) + 1, spans[name].end(2) - 1, escape(value, _QUOTES).encode()
+    if added:
+        yield end, end, added.encode()
+    if e.first_child:
+        gap = _GAP.match(data, stop)
+        yield stop, stop, _line_start(gap[0] if gap else b"") + e.first_child.encode()
+
+
+def _line_start(gap: bytes) -> bytes:
+    """The last line break of a gap, as the file writes it, and the indentation after it."""
+    head, newline, indentation = gap.rpartition(b"\n")
+    return (b"\r" if head.endswith(b"\r") else b"") + newline + indentation if newline else b""

@@ -1,0 +1,548 @@
+r"""The serial arm in a user's MJCF.
+
+MuJoCo's own compiler reads the file, so defaults, includes, units and inertia from geoms are as MuJoCo has
+them. What the arm is: the hinges and slides met one after another on the way out from the world. Bodies
+without a joint, and the fingers of a gripper (where the chain branches), are lumped into the link that
+carries them, at the reference pose of the file.
+
+Link frame: the body's own where the joint turns about (or slides along) the body's +z through its origin,
+as in files made from a modified Denavit-Hartenberg table; else the body's turned by the smallest angle that
+brings z onto the axis, with its origin at the joint's position.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxpanda_kernels import Chain
+from jaxtyping import Float
+
+from . import markup
+from .arm import Arm
+from .errors import InputError
+
+
+FINGER_JOINTS = 4
+"""Most joints one after another in a finger; longer branches are arms of their own."""
+
+_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_ROW, _COLUMN = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])  # of jaxpanda_kernels.inertia
+
+
+@dataclasses.dataclass(frozen=True)
+class MjcfLink:
+    """Where a link of the arm stands in the file."""
+
+    body: str
+    joint: str
+    body_id: int
+    joint_id: int
+    dof: int
+    """Address of the joint in MuJoCo's qvel and, as all joints here have one coordinate, of its friction."""
+    qpos: int
+    R: Float[np.ndarray, "3 3"]
+    """Axes of the link's frame in the body's."""
+    p: Float[np.ndarray, "3"]
+    """Origin of the link's frame in the body's [m]."""
+    lumped: tuple[str, ...]
+    """Bodies carried by this one and counted with it."""
+    lumped_standard: Float[np.ndarray, "10"]
+    """Their parameters together, in the link's frame."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MjcfSource:
+    """A user's file: its text, what MuJoCo made of it, and where the arm's links stand in it."""
+
+    document: markup.Document
+    model: mujoco.MjModel
+    """Compiled without the meshes that only give looks or contacts."""
+    links: tuple[MjcfLink, ...]
+    degrees: bool
+    """Angles in the file are in degrees."""
+    notes: tuple[str, ...]
+    """What was lumped, locked or left aside, a sentence each."""
+
+    @property
+    def path(self) -> Path:
+        return self.document.path
+
+    @property
+    def text(self) -> str:
+        return self.document.text
+
+    def qpos(self, q: Float[np.ndarray, "*time dof"]) -> Float[np.ndarray, "*time nq"]:
+        """MuJoCo's positions for the arm's, everything else at its reference."""
+        full = np.broadcast_to(self.model.qpos0, (*q.shape[:-1], self.model.nq)).copy()
+        full[..., [link.qpos for link in self.links]] = q
+        return full
+
+    def qvel(self, qd: Float[np.ndarray, "*time dof"]) -> Float[np.ndarray, "*time nv"]:
+        """MuJoCo's velocities (or accelerations) for the arm's, everything else at rest."""
+        full = np.zeros((*qd.shape[:-1], self.model.nv))
+        full[..., [link.dof for link in self.links]] = qd
+        return full
+
+
+def from_mjcf(path: str | Path) -> tuple[Arm, MjcfSource]:
+    """The serial arm in an MJCF file, and where its parts stand in it.
+
+    Meshes may be missing where a body has its `inertial`. `gravcomp` is no part of the arm: it is a force of
+    the simulation, while a measured torque carries the weight.
+
+    Raises:
+        InputError: no MJCF, one that MuJoCo refuses, or something that a serial arm cannot represent.
+    """
+    return from_document(markup.read(path, "mujoco"))
+
+
+def from_document(document: markup.Document) -> tuple[Arm, MjcfSource]:
+    """`from_mjcf` of a text that need not be on disk; names in it are relative to `document.path`."""
+    spec = _parse(document)
+    notes = _drop_looks(spec, document)
+    model = _compile(spec, document.path)
+    joints, locked = _serial_joints(model, document.path)
+    _check_joints(model, joints, document.path)
+    notes += _notes(model, joints, locked)
+    links, chain, standard = _links(model, joints)
+    source = MjcfSource(document, model, links, bool(spec.compiler.degree), tuple(notes))
+    return _arm(model, links, chain, standard, spec.modelname or document.path.stem), source
+
+
+def load_model(path: str | Path) -> mujoco.MjModel:
+    """The compiled model of a file, without the meshes that only give looks or contacts.
+
+    Raises:
+        InputError: no MJCF, or one that MuJoCo refuses.
+    """
+    document = markup.read(path, "mujoco")
+    spec = _parse(document)
+    _drop_looks(spec, document)
+    return _compile(spec, document.path)
+
+
+def _parse(document: markup.Document) -> mujoco.MjSpec:
+    try:
+        spec = mujoco.MjSpec.from_string(document.text, include=document.includes)
+    except ValueError as error:
+        raise InputError(f"{document.path}: {_sentence(error)}") from None
+    spec.modelfiledir = str(document.path.parent)
+    spec.compiler.fusestatic = False  # the bodies stay those of the text; the mechanics are the same
+    return spec
+
+
+def _compile(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise InputError(f"{path}: {_sentence(error)}") from None
+
+
+def _sentence(error: ValueError) -> str:
+    """MuJoCo's message on one line."""
+    head, *rest = [line.strip() for line in str(error).splitlines() if line.strip()]
+    head = head.removeprefix("XML Error: ").removeprefix("Error: ")
+    return f"MuJoCo refuses it: {head}" + (f" ({', '.join(rest)})" if rest else "")
+
+
+def _drop_looks(spec: mujoco.MjSpec, document: markup.Document) -> list[str]:
+    """Let no mesh, height field, skin or picture be read that has no say in the dynamics.
+
+    A geom of such a mesh becomes a small sphere, so that whatever refers to it still can.
+    """
+    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+    dropped = 0
+    for geom in spec.geoms:
+        if not (geom.meshname or geom.hfieldname):
+            continue
+        if _gives_inertia(spec, geom):
+            _check_mesh(spec, geom, document)
+            continue
+        geom.type, geom.meshname, geom.hfieldname = sphere, "", ""
+        geom.size, geom.fromto = [0.01, 0, 0], np.full(6, np.nan)
+        dropped += 1
+    for site in spec.sites:
+        if site.meshname:
+            site.type, site.meshname, site.size = sphere, "", [0.01, 0, 0]
+    kept = {geom.meshname for geom in spec.geoms}
+    meshes = [mesh for mesh in spec.meshes if (mesh.name or Path(mesh.file).stem) not in kept]
+    for unused in [*meshes, *spec.hfields, *spec.skins]:
+        spec.delete(unused)
+    for texture in spec.textures:
+        if texture.builtin == mujoco.mjtBuiltin.mjBUILTIN_NONE:
+            texture.file, texture.builtin, texture.width, texture.height = (
+                "",
+                mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+                2,
+                2,
+            )
+            for i in range(len(texture.cubefiles)):
+                texture.cubefiles[i] = ""
+    return [f"{dropped} mesh geoms that give looks or contacts only were not read"] if dropped else []
+
+
+def _gives_inertia(spec: mujoco.MjSpec, geom) -> bool:
+    """MuJoCo's rule: which geoms have a say in the inertia of their body."""
+    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    never = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    low, high = spec.compiler.inertiagrouprange
+    weightless = geom.mass == 0 or (np.isnan(geom.mass) and geom.density == 0)
+    explicit = geom.parent.explicitinertial and not always
+    return not (
+        geom.parent.name == "world" or explicit or never or weightless or not low <= geom.group <= high
+    )
+
+
+def _check_mesh(spec: mujoco.MjSpec, geom, document: markup.Document) -> None:
+    named = [mesh.file for mesh in spec.meshes if (mesh.name or Path(mesh.file).stem) == geom.meshname]
+    file = document.path.parent / spec.meshdir / (named[0] if named else "")
+    if not file.exists():
+        raise InputError(
+            f"{document.path}: body {geom.parent.name!r} takes its inertia from mesh {geom.meshname!r}, and {file}"
+            " is missing; put the mesh there or give the body an <inertial>"
+        )
+
+
+def _serial_joints(model: mujoco.MjModel, path: Path) -> tuple[list[int], list[int]]:
+    """Joints of the arm from the base outwards, and joints of a gripper behind it."""
+    trees = _trees(model)
+    if not trees:
+        raise InputError(f"{path}: has no joint, so there is no arm in it")
+    arms = [root for root in trees if not _is_object(model, root)]
+    if not arms:
+        joint = _joint_name(model, int(model.body_jntadr[trees[0]]))
+        raise InputError(
+            f"{path}: {joint} is a free or ball joint; an arm needs a fixed base, hinges and slides"
+        )
+    if len(arms) > 1:
+        a, b = (_body_name(model, body) for body in arms[:2])
+        raise InputError(
+            f"{path}: {a} and {b} both start a mechanism on the world; one serial arm is expected"
+        )
+    body, joints = arms[0], []
+    while True:
+        if model.body_jntnum[body] > 1:
+            raise InputError(
+                f"{path}: {_body_name(model, body)} has {model.body_jntnum[body]} joints; give each joint a body"
+            )
+        joints.append(int(model.body_jntadr[body]))
+        branches = _moving_children(model, body)
+        if len(branches) != 1:
+            break
+        body = branches[0]
+    for branch in branches:
+        if _depth(model, branch) > min(FINGER_JOINTS, len(joints) - 1):
+            others = " and ".join(_body_name(model, b) for b in branches[:2])
+            raise InputError(
+                f"{path}: the arm branches at {_body_name(model, body)} into {others}; one serial arm is expected"
+            )
+    locked = [j for branch in branches for b in _subtree(model, branch) for j in _joints_of(model, b)]
+    return joints, locked
+
+
+def _trees(model: mujoco.MjModel) -> list[int]:
+    """The first moving body of everything that stands on the world."""
+    return [b for b in range(1, model.nbody) if model.body_jntnum[b] and _moving_parent(model, b) == 0]
+
+
+def _is_object(model: mujoco.MjModel, root: int) -> bool:
+    """A thing that floats freely in the scene, and is not the base of an arm."""
+    free = model.jnt_type[model.body_jntadr[root]] == _FREE
+    return bool(free) and not _moving_children(model, root)
+
+
+def _moving_parent(model: mujoco.MjModel, body: int) -> int:
+    body = int(model.body_parentid[body])
+    while body and not model.body_jntnum[body]:
+        body = int(model.body_parentid[body])
+    return body
+
+
+def _moving_children(model: mujoco.MjModel, body: int) -> list[int]:
+    return [b for b in range(1, model.nbody) if model.body_jntnum[b] and _moving_parent(model, b) == body]
+
+
+def _subtree(model: mujoco.MjModel, body: int) -> list[int]:
+    """The body and the moving bodies beyond it."""
+    return [body] + [b for child in _moving_children(model, body) for b in _subtree(model, child)]
+
+
+def _depth(model: mujoco.MjModel, body: int) -> int:
+    deeper = [_depth(model, child) for child in _moving_children(model, body)]
+    return int(model.body_jntnum[body]) + max(deeper, default=0)
+
+
+def _joints_of(model: mujoco.MjModel, body: int) -> list[int]:
+    return list(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]))
+
+
+def _check_joints(model: mujoco.MjModel, joints: list[int], path: Path) -> None:
+    """Refuse what a chain of linear joints cannot represent."""
+    dofs = model.jnt_dofadr[joints]
+    for joint, dof in zip(joints, dofs, strict=True):
+        name = _joint_name(model, joint)
+        if model.jnt_type[joint] not in (_HINGE, _SLIDE):
+            raise InputError(
+                f"{path}: {name} is a free or ball joint; an arm needs a fixed base, hinges and slides"
+            )
+        if np.any(model.dof_dampingpoly[dof]) or np.any(model.jnt_stiffnesspoly[joint]):
+            raise InputError(
+                f"{path}: {name} has polynomial damping or stiffness; only the linear term is understood"
+            )
+        if model.jnt_plasticadr[joint] >= 0:
+            raise InputError(
+                f"{path}: {name} has a spring that yields (springyield); only linear springs are understood"
+            )
+    _check_actuators(model, joints, path)
+    _check_tendons(model, joints, path)
+    _check_loops(model, joints, path)
+
+
+def _check_actuators(model: mujoco.MjModel, joints: list[int], path: Path) -> None:
+    """An actuator may push; what it adds to inertia and damping must stand at the joint."""
+    for actuator in range(model.nactuator):
+        loads = (
+            model.actuator_armature[actuator],
+            model.actuator_damping[actuator],
+            *np.ravel(model.actuator_dampingpoly[actuator]),
+        )
+        target, kind = int(model.actuator_trnid[actuator, 0]), model.actuator_trntype[actuator]
+        if kind == mujoco.mjtTrn.mjTRN_TENDON:
+            elsewhere = not _spans(model, target, joints)
+        else:
+            elsewhere = kind == mujoco.mjtTrn.mjTRN_JOINT and target not in joints
+        if np.any(loads) and not elsewhere:
+            name = model.actuator(actuator).name or f"number {actuator + 1}"
+            raise InputError(
+                f"{path}: actuator {name!r} has armature or damping of its own, which MJX ignores; give it to the joint"
+            )
+
+
+def _check_tendons(model: mujoco.MjModel, joints: list[int], path: Path) -> None:
+    """A tendon over the arm's joints may drive them, not load them."""
+    for tendon in range(model.ntendon):
+        loads = (
+            model.tendon_stiffness[tendon],
+            model.tendon_damping[tendon],
+            model.tendon_frictionloss[tendon],
+            model.tendon_armature[tendon],
+            *np.ravel(model.tendon_stiffnesspoly[tendon]),
+            *np.ravel(model.tendon_dampingpoly[tendon]),
+        )
+        if np.any(loads) and _spans(model, tendon, joints):
+            name = model.tendon(tendon).name or f"number {tendon + 1}"
+            raise InputError(
+                f"{path}: tendon {name!r} puts stiffness, damping, friction or armature across joints of the arm;"
+                " give them to the joints"
+            )
+
+
+def _spans(model: mujoco.MjModel, tendon: int, joints: list[int]) -> bool:
+    """Whether the tendon's length depends on one of the joints."""
+    start, count = model.ten_J_rowadr[tendon], model.ten_J_rownnz[tendon]
+    return bool(set(model.ten_J_colind[start : start + count]) & set(model.jnt_dofadr[joints]))
+
+
+def _check_loops(model: mujoco.MjModel, joints: list[int], path: Path) -> None:
+    """An equality constraint may tie fingers to each other or things to the world, not links of the arm."""
+    bodies = set(model.jnt_bodyid[joints].tolist())
+    owner = _owners(model, joints)
+    for eq in range(model.neq):
+        kind, a, b = model.eq_type[eq], int(model.eq_obj1id[eq]), int(model.eq_obj2id[eq])
+        name = model.equality(eq).name or f"number {eq + 1}"
+        if kind == mujoco.mjtEq.mjEQ_JOINT:
+            closes = a in joints or b in joints
+        elif kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
+            if model.eq_objtype[eq] == mujoco.mjtObj.mjOBJ_SITE:
+                a, b = int(model.site_bodyid[a]), int(model.site_bodyid[b])
+            # Fingers belong to the last link, so a loop within the gripper has one owner on both sides.
+            closes = owner[a] != owner[b] and bool({owner[a], owner[b]} & bodies)
+        else:
+            closes = False
+        if closes and model.eq_active0[eq]:
+            raise InputError(f"{path}: equality {name!r} closes a loop over the arm; a serial arm has none")
+
+
+def _owners(model: mujoco.MjModel, joints: list[int]) -> np.ndarray:
+    """For every body the body of the arm that carries it; 0 for the world, -1 for things that are loose."""
+    bodies = set(model.jnt_bodyid[joints].tolist())
+    owner = np.zeros(model.nbody, int)
+    for body in range(1, model.nbody):
+        carried = owner[model.body_parentid[body]]
+        if body in bodies:
+            owner[body] = body
+        elif carried == 0 and model.body_jntnum[body]:
+            owner[body] = -1
+        else:
+            owner[body] = carried
+    return owner
+
+
+def _notes(model: mujoco.MjModel, joints: list[int], locked: list[int]) -> list[str]:
+    notes = []
+    if locked:
+        names = ", ".join(model.joint(j).name or f"number {j + 1}" for j in locked)
+        notes.append(f"gripper joints {names} are locked at their reference and lumped into the last link")
+    owner = _owners(model, joints)
+    if np.any(owner < 0):
+        notes.append(f"{int(np.sum(owner < 0))} loose bodies of the scene are no part of the arm")
+    if np.any(model.body_gravcomp[owner > 0]):
+        notes.append(
+            "gravcomp is ignored: it is a force of the simulation; a measured torque carries the weight"
+        )
+    if model.opt.density or model.opt.viscosity:
+        notes.append("the drag of the medium (density, viscosity) is ignored")
+    return notes
+
+
+def _links(
+    model: mujoco.MjModel, joints: list[int]
+) -> tuple[tuple[MjcfLink, ...], Chain, Float[np.ndarray, "dof 10"]]:
+    """The links, their chain and their parameters."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)  # at the reference pose of the file
+    pose = [(data.xmat[b].reshape(3, 3), data.xpos[b]) for b in range(model.nbody)]
+    owner = _owners(model, joints)
+    gravity = np.zeros(3) if _disabled(model, "GRAVITY") else model.opt.gravity.copy()
+
+    links, standard, rotations, origins = [], [], [], []
+    R_wp, p_wp = np.eye(3), np.zeros(3)
+    for joint in joints:
+        body = int(model.jnt_bodyid[joint])
+        R_bl, p_bl = _link_frame(model, joint)
+        R_wb, p_wb = pose[body]
+        R_wl, p_wl = R_wb @ R_bl, p_wb + R_wb @ p_bl
+        R, p = R_wp.T @ R_wl, R_wp.T @ (p_wl - p_wp)
+        q0 = float(model.qpos0[model.jnt_qposadr[joint]])
+        slides = model.jnt_type[joint] == _SLIDE
+        rotations.append(R if slides else R @ _turn_z(-q0))
+        origins.append(p - q0 * R[:, 2] if slides else p)
+
+        phi = {b: _body_standard(model, b, pose[b], (R_wl, p_wl)) for b in np.flatnonzero(owner == body)}
+        own = phi.pop(body)
+        lumped = np.sum(list(phi.values()), 0) if phi else np.zeros(10)
+        standard.append(own + lumped)
+        links.append(
+            MjcfLink(
+                body=model.body(body).name or f"body{body}",
+                joint=model.joint(joint).name or f"joint{joint + 1}",
+                body_id=body,
+                joint_id=joint,
+                dof=int(model.jnt_dofadr[joint]),
+                qpos=int(model.jnt_qposadr[joint]),
+                R=R_bl,
+                p=p_bl,
+                lumped=tuple(model.body(int(b)).name or f"body{b}" for b in phi),
+                lumped_standard=lumped,
+            )
+        )
+        R_wp, p_wp = R_wl, p_wl
+    chain = Chain(
+        jnp.asarray(np.stack(rotations)),
+        jnp.asarray(np.stack(origins)),
+        jnp.asarray(model.jnt_type[joints] == _SLIDE),
+        jnp.asarray(gravity),
+    )
+    return tuple(links), chain, np.stack(standard)
+
+
+def _link_frame(model: mujoco.MjModel, joint: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of the link's frame in the body's."""
+    axis, position = model.jnt_axis[joint], model.jnt_pos[joint]
+    slides = model.jnt_type[joint] == _SLIDE
+    upright = np.array_equal(axis, [0, 0, 1])
+    through_origin = upright and not np.any(np.cross(axis, position))
+    R = np.eye(3) if upright else _smallest_turn(axis)
+    return R, np.zeros(3) if slides or through_origin else position.copy()
+
+
+def _smallest_turn(axis: np.ndarray) -> np.ndarray:
+    """Rotation by the smallest angle that takes z to `axis`; about x where they are opposite."""
+    x, y, c = axis / np.linalg.norm(axis)
+    s = np.hypot(x, y)
+    if s == 0:
+        return np.diag([1.0, c, c])
+    n = np.array([-y, x, 0]) / s
+    n_cross = np.array([[0, 0, n[1]], [0, 0, -n[0]], [-n[1], n[0], 0]])
+    return c * np.eye(3) + s * n_cross + (1 - c) * np.outer(n, n)
+
+
+def _turn_z(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def _body_standard(model, body, pose, frame) -> np.ndarray:
+    """Parameters of one body in a frame, both posed in the world."""
+    (R_wb, p_wb), (R_wl, p_wl) = pose, frame
+    R_bi = np.zeros(9)
+    mujoco.mju_quat2Mat(R_bi, model.body_iquat[body])
+    R_li = R_wl.T @ R_wb @ R_bi.reshape(3, 3)
+    com = R_wl.T @ (p_wb + R_wb @ model.body_ipos[body] - p_wl)
+    return standard_from_com(model.body_mass[body], com, R_li @ np.diag(model.body_inertia[body]) @ R_li.T)
+
+
+def standard_from_com(mass: float, com: np.ndarray, I_com: np.ndarray) -> Float[np.ndarray, "10"]:
+    """`jaxpanda_kernels.inertia.from_com` in float64, whatever JAX is set to."""
+    I = I_com + mass * (com @ com * np.eye(3) - np.outer(com, com))
+    return np.concatenate([[mass], mass * com, I[_ROW, _COLUMN]])
+
+
+def com_from_standard(phi: Float[np.ndarray, "10"]) -> tuple[float, np.ndarray, np.ndarray]:
+    """`jaxpanda_kernels.inertia.to_com` in float64, whatever JAX is set to."""
+    mass, com = float(phi[0]), phi[1:4] / phi[0]
+    I = np.zeros((3, 3))
+    I[_ROW, _COLUMN] = I[_COLUMN, _ROW] = phi[4:]
+    return mass, com, I - mass * (com @ com * np.eye(3) - np.outer(com, com))
+
+
+def move_standard(
+    phi: Float[np.ndarray, "10"], R_ab: np.ndarray, p_ab: np.ndarray
+) -> Float[np.ndarray, "10"]:
+    """`jaxpanda_kernels.inertia.move` in float64, whatever JAX is set to."""
+    I, h = np.zeros((3, 3)), phi[1:4]
+    I[_ROW, _COLUMN] = I[_COLUMN, _ROW] = phi[4:]
+    J = np.block([[np.trace(I) / 2 * np.eye(3) - I, h[:, None]], [h[None, :], phi[:1, None]]])
+    X = np.block([[R_ab, p_ab[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+    J = X @ J @ X.T
+    I = np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3]
+    return np.concatenate([J[3:, 3], J[:3, 3], I[_ROW, _COLUMN]])
+
+
+def _arm(model, links, chain: Chain, standard: np.ndarray, name: str) -> Arm:
+    joints = [link.joint_id for link in links]
+    dofs = [link.dof for link in links]
+    limited = model.jnt_limited[joints].astype(bool)
+
+    def unless(flag: str, values: np.ndarray):
+        return jnp.asarray(np.zeros(len(links)) if _disabled(model, flag) else values)
+
+    return Arm(
+        chain=chain,
+        standard=jnp.asarray(standard),
+        armature=jnp.asarray(model.dof_armature[dofs]),
+        damping=unless("DAMPER", model.dof_damping[dofs]),
+        frictionloss=unless("FRICTIONLOSS", model.dof_frictionloss[dofs]),
+        stiffness=unless("SPRING", model.jnt_stiffness[joints]),
+        springref=jnp.asarray(model.qpos_spring[[link.qpos for link in links]]),
+        lower=jnp.asarray(np.where(limited, model.jnt_range[joints, 0], -np.inf)),
+        upper=jnp.asarray(np.where(limited, model.jnt_range[joints, 1], np.inf)),
+        joint_names=tuple(link.joint for link in links),
+        link_names=tuple(link.body for link in links),
+        name=name,
+    )
+
+
+def _disabled(model: mujoco.MjModel, flag: str) -> bool:
+    return bool(model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"))
+
+
+def _body_name(model: mujoco.MjModel, body: int) -> str:
+    return f"body {model.body(body).name!r}" if model.body(body).name else f"body number {body}"
+
+
+def _joint_name(model: mujoco.MjModel, joint: int) -> str:
+    return f"joint {model.joint(joint).name!r}" if model.joint(joint).name else f"joint number {joint + 1}"
