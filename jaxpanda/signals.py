@@ -1,9 +1,9 @@
 r"""Recordings into signals that a regression can use: uniform, differentiated, filtered alike on both sides.
 
-Velocity and acceleration come from q alone: it is low-passed without phase (4th-order Butterworth, forward and
-backward, hence -6 dB at the cutoff) and differentiated by central differences of sixth order. A logged dq is late by
-milliseconds and is not used. Then every column of the regressor and the torque pass through one more such low-pass,
-`Signals.lowpass`: "parallel filtering". It is linear, edges included, so that
+Velocity and acceleration come from q alone: it is low-passed without phase (4th-order Butterworth, forward
+and backward, hence -6 dB at the cutoff) and differentiated by central differences of sixth order. A logged dq
+is late by milliseconds and is not used. Then every column of the regressor and the torque pass through one
+more such low-pass, `Signals.lowpass`: "parallel filtering". It is linear, edges included, so that
 $F\tau - F W\beta = F(\tau - W\beta)$: what the filter does at the edges it does to the residual only.
 """
 
@@ -20,7 +20,6 @@ from jaxtyping import Bool, Float, Int
 from .errors import InputError
 from .recordings import Recording
 from .recordings.ticks import PERIODS
-
 
 DERIVATIVE_CUTOFF = 25.0
 """Low-pass of q before it is differentiated [Hz], where the rate allows it."""
@@ -84,7 +83,7 @@ class Signals:
         """Of the output grid [Hz]."""
         return self.rate / float(np.min(np.diff(self.keep), initial=len(self.time)))
 
-    def lowpass(self, x: Float[np.ndarray, "time *columns"]) -> Float[np.ndarray, "kept *columns"]:
+    def lowpass(self, x: Float[np.ndarray, "time ..."]) -> Float[np.ndarray, "kept ..."]:
         """Anything on the full grid, low-passed without phase at `cutoff`, on the output grid."""
         return zero_phase(np.asarray(x, dtype=float), self.cutoff, self.rate)[self.keep]
 
@@ -102,10 +101,10 @@ def prepare(
     Args:
         recording: as read.
         cutoff: of the low-pass that regressor and torque share [Hz].
-        derivative_cutoff: of the low-pass of q [Hz]; 25 Hz, or more for a high `cutoff`, but at most 0.4 of the rate.
-        rate: of the output grid [Hz]; the nearest that divides the recording's rate is used, 100 Hz at most.
-        trim: left out at both ends [s]; 0.6 s or one period of `cutoff`, whichever is longer, after which what the
-            filter makes up beyond the ends is below 1e-4 N m at 5 Hz (0.02 N m at 1 Hz).
+        derivative_cutoff: of the low-pass of q [Hz]; 25 Hz, more for a high cutoff, at most 0.4 of the rate.
+        rate: of the output grid [Hz], at most; 100 Hz by default. Every n-th point of the full grid is kept.
+        trim: left out at both ends [s]; 0.6 s or one period of `cutoff`, whichever is longer. What the filter
+            makes up beyond the ends is then below 1e-4 N m at 5 Hz (0.02 N m at 1 Hz).
 
     Raises:
         InputError: a cutoff that the rate does not allow, or too short a recording.
@@ -135,13 +134,11 @@ def prepare(
     )
 
 
-def zero_phase(
-    x: Float[np.ndarray, "time *columns"], cutoff: float, rate: float
-) -> Float[np.ndarray, "time *columns"]:
+def zero_phase(x: Float[np.ndarray, "time ..."], cutoff: float, rate: float) -> Float[np.ndarray, "time ..."]:
     """A 4th-order Butterworth low-pass, run forward and backward over the first axis.
 
-    Beyond the ends x continues point-symmetrically for 1.5 periods of the cutoff: of the usual continuations this
-    disturbs a position least.
+    Beyond the ends x continues point-symmetrically for 1.5 periods of the cutoff: of the usual continuations
+    this disturbs a position least.
     """
     sos = scipy.signal.butter(_ORDER, cutoff, fs=rate, output="sos")
     pad = min(round(1.5 * rate / cutoff), len(x) - 1)
@@ -166,8 +163,8 @@ def derivatives(
 def white_noise(tau: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof"]:
     r"""Standard deviation of what changes from one sample to the next [N m].
 
-    From third differences, $\sigma^2 = \langle(\Delta^3\tau)^2\rangle / 20$, where the motion has gone. Slower noise
-    (resonances, drift) is not in it.
+    From third differences, $\sigma^2 = \langle(\Delta^3\tau)^2\rangle / 20$, where the motion has gone.
+    Slower noise (resonances, drift) is not in it.
     """
     return np.sqrt(np.mean(np.diff(tau, n=3, axis=0) ** 2, axis=0) / 20)
 
@@ -224,8 +221,8 @@ Split = tuple[Bool[np.ndarray, " kept"], Bool[np.ndarray, " kept"]]
 def blocks(signals: Signals, folds: int = 5, guard: float = 0.1) -> list[Split]:
     """Splits for cross-validation that never test on a repeat of training data.
 
-    A motion that repeats itself is cut by its phase: all repeats of a block are held out together. Any other is
-    cut by time.
+    A motion that repeats itself is cut by its phase: all repeats of a block are held out together. Any other
+    is cut by time.
 
     Args:
         signals: one motion.
@@ -282,8 +279,8 @@ def time_split(
         )
     if signals.period is not None and not allow_repeats and np.any(t[test] - signals.period >= t[0]):
         raise InputError(
-            f"{signals.name}: the motion repeats itself after {signals.period:.3f} s, so that a test on what comes "
-            f"after {border:.2f} s would repeat training data: use phase blocks"
+            f"{signals.name}: the motion repeats itself after {signals.period:.3f} s, so that a test on what "
+            f"comes after {border:.2f} s would repeat training data: use phase blocks"
         )
     return train, test
 
@@ -334,8 +331,8 @@ def _cutoffs(
     for what, value in (("cutoff", cutoff), ("derivative_cutoff", chosen)):
         if not 0 < value < 0.5 * rate:
             raise InputError(
-                f"{name}: {what} {value:g} Hz, where a recording at {rate:.4g} Hz allows more than 0 and less than "
-                f"{0.5 * rate:.4g} Hz"
+                f"{name}: {what} {value:g} Hz, where a recording at {rate:.4g} Hz allows more than 0 and "
+                f"less than {0.5 * rate:.4g} Hz"
             )
     if cutoff > chosen:
         raise InputError(
@@ -357,7 +354,7 @@ def _kept(
         raise InputError(
             f"{recording.name}: trim {trim:g} s and rate {rate:g} Hz cannot be: use positive numbers"
         )
-    stride = max(1, round(1 / (rate * step)))
+    stride = max(1, int(np.ceil(1 / (rate * step) - 1e-6)))
     slack = 1e-6 * step
     inside = (time >= time[0] + trim - slack) & (time <= time[-1] - trim + slack)
     t = recording.time
@@ -367,14 +364,14 @@ def _kept(
     keep = places[inside & ((places - np.argmax(inside)) % stride == 0)]
     if len(keep) < 2:
         raise InputError(
-            f"{recording.name}: {time[-1] - time[0]:.3g} s are too short, for {trim:g} s are left out at both ends"
-            " and around gaps: record longer, or lower trim or raise cutoff"
+            f"{recording.name}: {time[-1] - time[0]:.3g} s are too short, for {trim:g} s are left out at "
+            "both ends and around gaps: record longer, or lower trim or raise cutoff"
         )
     return keep
 
 
 def _clocks(signals: Sequence[Signals]) -> list[tuple[float, float, float, bool]]:
-    """For each recording: offset to the clock it shares, where that clock starts, its length, whether it is cyclic."""
+    """For each recording: offset to the clock it shares; that clock's start, length, and if it is cyclic."""
     offsets = [0.0] * len(signals)
     group = list(range(len(signals)))
     for a, b in itertools.combinations(range(len(signals)), 2):
@@ -401,10 +398,10 @@ def _shift(
 ) -> tuple[float, float] | None:
     """The shift s with q_b(t + s) = q_a(t), and for how long [s]; None if no motion repeats.
 
-    Shifts at which the mean square of q_b(t + s) - q_a(t) is small and smallest are tried: half of the path in the
-    overlap must agree, and a tenth of the shorter path, for a second at least. Rest does not count, nor does how a
-    motion starts and stops. Of one motion with itself the smallest such shift counts, of two that with most in
-    common.
+    Shifts at which the mean square of q_b(t + s) - q_a(t) is small and smallest are tried: half of the path
+    in the overlap must agree, and a tenth of the shorter path, for a second at least. Rest does not count,
+    nor does how a motion starts and stops. Of one motion with itself the smallest such shift counts, of two
+    that with most in common.
     """
     same = q_a is q_b
     grid_a, grid_b = (np.arange(t[0], t[-1], _SEARCH_STEP) for t in (time_a, time_b))
@@ -433,7 +430,7 @@ def _shift(
 def _distances(
     a: Float[np.ndarray, "a dof"], b: Float[np.ndarray, "b dof"], same: bool
 ) -> tuple[Int[np.ndarray, " lag"], Float[np.ndarray, " lag"]]:
-    """rms of b[i + lag] - a[i] over each overlap of a second or more, by sums of squares and a correlation."""
+    """rms of b[i + lag] - a[i] over each overlap of a second or more, by squares and a correlation."""
     least = round(1.0 / _SEARCH_STEP)
     lags = np.arange(0 if same else least - len(a), len(b) - least + 1)
     first, last = np.maximum(0, -lags), np.minimum(len(a), len(b) - lags)  # what of a overlaps
@@ -447,7 +444,7 @@ def _distances(
 def _agreement(
     a: Float[np.ndarray, "a dof"], b: Float[np.ndarray, "b dof"], lag: int, tolerance: float
 ) -> tuple[float, float] | None:
-    """The shift near a lag [s], to a fraction of a step, and for how long a and b agree there [s], if they do."""
+    """The shift near a lag [s], to a fraction of a step, and how long a and b agree there [s], if they do."""
     first, last = max(0, -lag), min(len(a), len(b) - lag)
     x, y = a[first:last], b[first + lag : last + lag]
     speed = np.gradient(y, axis=0)

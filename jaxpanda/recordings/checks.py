@@ -7,7 +7,6 @@ import numpy as np
 from ..errors import InputError
 from .recording import Recording
 
-
 RATES = (50.0, 4000.0)
 """Sample rates that occur [Hz]."""
 SHORTEST = 0.25
@@ -51,8 +50,8 @@ def _finite(recording: Recording, row: Callable[[int], str]) -> None:
         if bad.size:
             more = f" and {bad.size - 1} more below it" if bad.size > 1 else ""
             raise InputError(
-                f"{recording.name}: column {name}, {row(bad[0])}: the value is {column[bad[0]]}{more}, where a "
-                "finite number is needed; leave out the rows that were not measured"
+                f"{recording.name}: column {name}, {row(bad[0])}: the value is {column[bad[0]]}{more}, where "
+                "a finite number is needed; leave out the rows that were not measured"
             )
 
 
@@ -63,8 +62,9 @@ def _ordered(recording: Recording, row: Callable[[int], str]) -> None:
         before, after = float(recording.time[i - 1]), float(recording.time[i])
         what = "repeats" if before == after else "goes back"
         raise InputError(
-            f"{recording.name}: column time, {row(i)}: time {what} ({before!r} s, then {after!r} s; {back.size} "
-            "such rows), where it must increase; sort the rows, drop repeated ones, or split the file into its runs"
+            f"{recording.name}: column time, {row(i)}: time {what} ({before!r} s, then {after!r} s; "
+            f"{back.size} such rows), where it must increase; sort the rows, drop repeated ones, or split "
+            "the file into its runs"
         )
 
 
@@ -78,12 +78,13 @@ def _rate(recording: Recording) -> None:
     for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
         if fastest <= step / factor <= slowest:
             raise InputError(
-                f"{recording.name}: column time looks like {unit} (its median step is {step:g}), where seconds "
-                f"are needed: divide it by {factor:g}"
+                f"{recording.name}: column time looks like {unit} (its median step is {step:g}), where "
+                f"seconds are needed: divide it by {factor:g}"
             )
     raise InputError(
-        f"{recording.name}: column time has a median step of {step:g} s ({1 / step:g} Hz), where sample rates from "
-        f"{RATES[0]:g} Hz to {RATES[1]:g} Hz in seconds can be used: check its unit, or record at such a rate"
+        f"{recording.name}: column time has a median step of {step:g} s ({1 / step:g} Hz), where sample "
+        f"rates from {RATES[0]:g} Hz to {RATES[1]:g} Hz in seconds can be used: check its unit, or record at "
+        "such a rate"
     )
 
 
@@ -91,8 +92,9 @@ def _long_enough(recording: Recording) -> None:
     duration = recording.time[-1] - recording.time[0] if recording.samples else 0.0
     if duration < SHORTEST:
         raise InputError(
-            f"{recording.name}: too short, {recording.samples} row{'s' * (recording.samples != 1)} over {duration:g} s, "
-            f"where at least {SHORTEST} s are needed (a few seconds of motion to filter it, ten or more to identify)"
+            f"{recording.name}: too short, {recording.samples} row{'s' * (recording.samples != 1)} over "
+            f"{duration:g} s, where at least {SHORTEST} s are needed (a few seconds of motion to filter it, "
+            "ten or more to identify)"
         )
 
 
@@ -103,8 +105,9 @@ def _radians(recording: Recording) -> None:
         j = int(np.argmax(furthest))
         row = int(np.argmax(np.abs(recording.q[:, j])))
         raise InputError(
-            f"{recording.name}: column q_{j + 1} reaches {recording.q[row, j]:g} at {recording.time[row]:g} s, which "
-            "looks like degrees where radians are needed: multiply positions (and velocities) by pi/180"
+            f"{recording.name}: column q_{j + 1} reaches {recording.q[row, j]:g} at {recording.time[row]:g} "
+            "s, which looks like degrees where radians are needed: multiply positions (and velocities) by "
+            "pi/180"
         )
 
 
@@ -126,7 +129,7 @@ def _velocity_unit(recording: Recording) -> None:
 
 
 def velocity_scale(recording: Recording) -> float | None:
-    """k of the least-squares fit dq = k d(q)/dt over 20 ms; None where it is not defined or explains little."""
+    """k of the least-squares fit dq = k d(q)/dt over 20 ms; None where it explains little."""
     if recording.qd is None:
         return None
     half = max(1, round(0.01 / float(np.median(np.diff(recording.time)))))

@@ -34,7 +34,8 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
     names = [cell.strip().strip("\"'").strip() for cell in header.split(delimiter)]
     if len(names) > 1 and all(_is_number(cell) for cell in names):
         raise InputError(
-            f"{path.name}: line {start + 1} holds numbers where the header must be: put the line {canonical(7)} first"
+            f"{path.name}: line {start + 1} holds numbers where the header must be: put the line "
+            f"{canonical(7)} first"
         )
     channels = find_channels(names, path.name, columns)
     body = lines[start + 1 :]

@@ -12,7 +12,6 @@ from .parquet import read_parquet, write_parquet
 from .raw_logs import read_raw_logs
 from .recording import Recording
 
-
 _READERS: Mapping[str, Callable[[Path, Mapping[str, str] | None], Recording]] = {
     "csv": read_csv,
     "npz": read_npz,
@@ -89,7 +88,8 @@ def _by_suffix(path: Path) -> str:
         if name.endswith(suffix):
             return kind
     raise InputError(
-        f"{path.name}: unknown kind of recording; a name ending in {', '.join(_SUFFIXES)}, or a folder of logs is needed"
+        f"{path.name}: unknown kind of recording; a name ending in {', '.join(_SUFFIXES)}, or a folder of "
+        "logs is needed"
     )
 
 

@@ -10,7 +10,6 @@ from ..errors import InputError
 from .checks import checked
 from .recording import Recording
 
-
 _ALIASES = {"time": ("time",), "q": ("q",), "dq": ("dq", "qd"), "tau": ("tau",)}
 
 

@@ -1,9 +1,10 @@
 """A folder with one text file a quantity, as control programs dump them.
 
-A file holds one number a line (`dof` consecutive numbers are a sample) or one sample a line. Time is what a host
-stamped: true ticks are reconstructed where they can be and are better (`ticks`).
+A file holds one number a line (`dof` consecutive numbers are a sample) or one sample a line. Time is what a
+host stamped: true ticks are reconstructed where they can be and are better (`ticks`).
 """
 
+import itertools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +17,6 @@ from .checks import checked
 from .recording import Recording
 from .text import numbers, read_text
 from .ticks import Ticks, consistent, reconstruct
-
 
 _WORDS = {
     "time": {"time", "times", "stamp", "stamps", "timestamp", "timestamps", "t"},
@@ -66,7 +66,7 @@ def read_raw_logs(path: Path, columns: Mapping[str, str] | None = None) -> list[
     stamps = logs["time"][:, 0]
     breaks = [0, *(np.flatnonzero(np.diff(stamps) < 0) + 1).tolist(), rows]
     runs = []
-    for number, (start, stop) in enumerate(zip(breaks[:-1], breaks[1:], strict=True), 1):
+    for number, (start, stop) in enumerate(itertools.pairwise(breaks), 1):
         name = path.name if len(breaks) == 2 else f"{path.name} (run {number})"
         run = {channel: log[start:stop] for channel, log in logs.items()}
         recording = Recording(name, stamps[start:stop], run["q"], run.get("dq"), run.get("tau"), path)
@@ -77,8 +77,8 @@ def read_raw_logs(path: Path, columns: Mapping[str, str] | None = None) -> list[
 def find_logs(path: Path, columns: Mapping[str, str] | None = None) -> dict[str, Path]:
     """Which file of a folder holds which quantity.
 
-    Commands (`gen_dq.txt`, `q_desired.txt`) are no measurements; of several candidates, those called `measured`
-    count, else those whose name begins like the other files'.
+    Commands (`gen_dq.txt`, `q_desired.txt`) are no measurements; of several candidates, those called
+    `measured` count, else those whose name begins like the other files'.
 
     Raises:
         InputError: no time or position file, or several that could be meant.
@@ -94,8 +94,9 @@ def find_logs(path: Path, columns: Mapping[str, str] | None = None) -> dict[str,
     for channel in ("time", "q"):
         if not found[channel]:
             raise InputError(
-                f"{path}: a folder without {'time stamps' if channel == 'time' else 'joint positions'}: one-number-a-line "
-                "logs like …time.txt, …positions.txt, …velocity.txt, …torques.txt (or .txt.gz) are needed"
+                f"{path}: a folder without {'time stamps' if channel == 'time' else 'joint positions'}: "
+                "one-number-a-line logs like …time.txt, …positions.txt, …velocity.txt, …torques.txt (or "
+                ".txt.gz) are needed"
             )
     beginnings = {_beginning(files[0]) for files in found.values() if len(files) == 1}
     chosen = {}
@@ -141,8 +142,8 @@ def _numbers(file: Path, channel: str) -> Float[np.ndarray, "row column"]:
     if bad.size:
         row, column = bad[0]
         raise InputError(
-            f"{file.name}: column {names[column]}, row {row + 1}: the value is {table[row, column]}, where a finite "
-            "number is needed; leave out the rows that were not measured"
+            f"{file.name}: column {names[column]}, row {row + 1}: the value is {table[row, column]}, where a "
+            "finite number is needed; leave out the rows that were not measured"
         )
     return table
 
@@ -157,13 +158,14 @@ def _samples(
         dof = max(1, round(len(table) / rows))
         if len(table) % dof:
             raise InputError(
-                f"{file.name}: {len(table)} numbers cannot be shared among the {rows} rows of {time_file.name}: "
-                "the last sample is cut off, or the files belong to different logs"
+                f"{file.name}: {len(table)} numbers cannot be shared among the {rows} rows of "
+                f"{time_file.name}: the last sample is cut off, or the files belong to different logs"
             )
         samples = table.reshape(-1, dof)
     if abs(len(samples) - rows) > _SLACK:
         raise InputError(
-            f"{file.name}: {len(samples)} rows, but {time_file.name} has {rows}: these files belong to different logs"
+            f"{file.name}: {len(samples)} rows, but {time_file.name} has {rows}: these files belong to "
+            "different logs"
         )
     return samples
 
@@ -193,7 +195,7 @@ def _on_ticks(recording: Recording, start: int, repairs: dict[str, int]) -> Reco
     repairs |= {
         "repeated rows dropped": int(np.sum(~new)),
         "rows moved from their stamp to their tick": int(np.sum(new)),
-        "of these, rows at rest, put on a tick by their stamp": ticks.stamped,
+        "rows at rest put on a tick by their stamp": ticks.stamped,
         "ticks missing between rows": int(ticks.tick[-1] + 1 - np.sum(new)),
     }
     moved = Recording(
@@ -224,6 +226,7 @@ def _replace(recording: Recording, repairs: dict[str, int], notes: tuple[str, ..
 
 def _evidence(ticks: Ticks) -> str:
     return (
-        f"rms(dq - d(q)/dt) is {ticks.mismatch_stamps:.3g} rad/s with the stamps and {ticks.mismatch_ticks:.3g} "
-        f"rad/s with ticks of {1e3 * ticks.period:g} ms, whose counts are integers to {ticks.residual:.2g}"
+        f"rms(dq - d(q)/dt) is {ticks.mismatch_stamps:.3g} rad/s with the stamps and "
+        f"{ticks.mismatch_ticks:.3g} rad/s with ticks of {1e3 * ticks.period:g} ms, whose counts are "
+        f"integers to {ticks.residual:.2g}"
     )

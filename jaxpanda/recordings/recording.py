@@ -62,6 +62,7 @@ class Recording:
         """The measured torque; refuse a motion."""
         if self.tau is None:
             raise InputError(
-                f"{self.name}: no columns tau_1 ... tau_{self.dof}: this needs measured joint torques, not a motion"
+                f"{self.name}: no columns tau_1 ... tau_{self.dof}: this needs measured joint torques, not a "
+                "motion"
             )
         return self.tau

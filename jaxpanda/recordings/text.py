@@ -76,8 +76,9 @@ def _first_fault(lines: list[str], delimiter: str | None, columns: list[str], fi
         cells = line.split(delimiter)
         if len(cells) != len(columns):
             return (
-                f"{where} has {len(cells)} cell{'s' * (len(cells) != 1)}, where the columns are {len(columns)} "
-                f"({columns[0]} ... {columns[-1]}): every row must have as many cells as there are columns"
+                f"{where} has {len(cells)} cell{'s' * (len(cells) != 1)}, where the columns are "
+                f"{len(columns)} ({columns[0]} ... {columns[-1]}): every row must have as many cells as "
+                "there are columns"
             )
         for column, cell in zip(columns, cells, strict=True):
             try:

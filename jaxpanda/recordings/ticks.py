@@ -5,21 +5,22 @@ gets to it. Position and velocity know better: between two rows the controller h
 
 $$ \Delta t = \frac{\sum_j \dot q_j\, \Delta q_j}{\sum_j \dot q_j^2}, $$
 
-the least-squares solution of $\Delta q_j = \dot q_j \Delta t$, and in units of the controller's period that is
-an integer: 0 where a row repeats the one before, 2 where one tick is missing. How far from integers the ratio
-is tells whether the ticks can be recovered at all, and rms(dq - d(q)/dt) tells whether they are worth it.
+the least-squares solution of $\Delta q_j = \dot q_j \Delta t$, and in units of the controller's period that
+is an integer: 0 where a row repeats the one before, 2 where one tick is missing. How far from integers the
+ratio is tells whether the ticks can be recovered at all, and rms(dq - d(q)/dt) tells whether they are worth
+it.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 from jaxtyping import Float, Int
 
-
 PERIODS = (0.25e-3, 0.5e-3, 1e-3, 2e-3, 2.5e-3, 4e-3, 5e-3, 8e-3, 10e-3, 20e-3)
 """Periods of robot controllers [s]."""
 SLOWEST = 0.05
-"""Below this joint speed, |dq| over all joints [rad/s], the ratio says nothing: velocity is late and noisy."""
+"""Below this speed, |dq| over all joints [rad/s], the ratio says nothing: velocity is late and noisy."""
 JITTER = 0.05
 """Stamps whose steps stay this close to their median, as a share of it, are the ticks already."""
 RESIDUAL = 0.1
@@ -66,8 +67,9 @@ def reconstruct(
 ) -> Ticks | None:
     """The tick of each row; None where the motion is too slow to tell.
 
-    At rest the ratio is ill-conditioned. There a row whose channels all repeat the row before is on the same tick,
-    and any other is as many ticks later as its stamp says. A rest inside the motion takes as long as the stamps say.
+    At rest the ratio is ill-conditioned. There a row whose channels all repeat the row before is on the same
+    tick, and any other is as many ticks later as its stamp says. A rest inside the motion takes as long as
+    the stamps say.
     """
     channels = np.column_stack([channel for channel in (q, qd, tau) if channel is not None])
     repeats = np.all(np.diff(channels, axis=0) == 0, axis=1)
@@ -96,7 +98,7 @@ def reconstruct(
 
 
 def _period(time: Float[np.ndarray, " time"], elapsed: Float[np.ndarray, " row"]) -> float:
-    """The longest controller period, near the stamps' median step, of which the elapsed times are multiples."""
+    """The longest period near the stamps' median step of which the elapsed times are multiples."""
     step = float(np.median(np.diff(time)))
     near = [period for period in PERIODS if 0.3 * step < period < 1.5 * step] or [step]
     for period in reversed(near):
@@ -108,7 +110,7 @@ def _period(time: Float[np.ndarray, " time"], elapsed: Float[np.ndarray, " row"]
 def _rests(moving: np.ndarray) -> list[tuple[int, int]]:
     """Spans [first, last) of steps at rest that have motion on both sides."""
     edges = np.flatnonzero(np.diff(moving.astype(int)))
-    return [(a + 1, b + 1) for a, b in zip(edges[:-1], edges[1:], strict=True) if not moving[a + 1]]
+    return [(a + 1, b + 1) for a, b in itertools.pairwise(edges) if not moving[a + 1]]
 
 
 def _stretched(steps: np.ndarray, total: int) -> np.ndarray:
