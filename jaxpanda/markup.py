@@ -13,7 +13,6 @@ from xml.sax.saxutils import escape
 
 from .errors import InputError
 
-
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
 _TAG = re.compile(rb"""<[^\s/>]+(?:"[^"]*"|'[^']*'|[^"'>])*>""")
 _GAP = re.compile(rb"\s*")
@@ -112,6 +111,11 @@ def edit(document: Document, edits: Iterable[Edit]) -> Document:
     return parse(texts[""], document.root.tag, document.path, {k: v for k, v in texts.items() if k})
 
 
+def quote(value: str) -> str:
+    """A value as it stands between the quotes of an attribute."""
+    return escape(value, _QUOTES)
+
+
 def _decode(data: bytes, path: Path) -> str:
     if not data.strip():
         raise InputError(f"{path}: is empty")
@@ -200,11 +204,11 @@ def _replacements(data: bytes, e: Edit) -> Iterator[tuple[int, int, bytes]]:
     added = ""
     for name, value in e.attributes.items():
         if name not in spans:
-            added += f' {name}="{escape(value, _QUOTES)}"' if value is not None else ""
+            added += f' {name}="{quote(value)}"' if value is not None else ""
         elif value is None:
             yield spans[name].start(), spans[name].end(), b""
         else:
-            yield spans[name].start(2) + 1, spans[name].end(2) - 1, escape(value, _QUOTES).encode()
+            yield spans[name].start(2) + 1, spans[name].end(2) - 1, quote(value).encode()
     if added:
         yield end, end, added.encode()
     if e.first_child:

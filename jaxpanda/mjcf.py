@@ -10,6 +10,8 @@ as in files made from a modified Denavit-Hartenberg table; else the body's turne
 brings z onto the axis, with its origin at the joint's position.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo's names come from a compiled module without stubs.
 import dataclasses
 from pathlib import Path
 
@@ -22,7 +24,6 @@ from jaxtyping import Float
 from . import markup
 from .arm import Arm
 from .errors import InputError
-
 
 FINGER_JOINTS = 4
 """Most joints one after another in a finger; longer branches are arms of their own."""
@@ -61,6 +62,8 @@ class MjcfSource:
     model: mujoco.MjModel
     """Compiled without the meshes that only give looks or contacts."""
     links: tuple[MjcfLink, ...]
+    standard: Float[np.ndarray, "dof 10"]
+    """Parameters of the links, what is lumped into them included, in float64 whatever JAX is set to."""
     degrees: bool
     """Angles in the file are in degrees."""
     notes: tuple[str, ...]
@@ -108,12 +111,16 @@ def from_document(document: markup.Document) -> tuple[Arm, MjcfSource]:
     _check_joints(model, joints, document.path)
     notes += _notes(model, joints, locked)
     links, chain, standard = _links(model, joints)
-    source = MjcfSource(document, model, links, bool(spec.compiler.degree), tuple(notes))
+    source = MjcfSource(document, model, links, standard, bool(spec.compiler.degree), tuple(notes))
     return _arm(model, links, chain, standard, spec.modelname or document.path.stem), source
 
 
-def load_model(path: str | Path) -> mujoco.MjModel:
+def load_model(path: str | Path, *, balanceinertia: bool = False) -> mujoco.MjModel:
     """The compiled model of a file, without the meshes that only give looks or contacts.
+
+    Args:
+        path: of the MJCF.
+        balanceinertia: let MuJoCo replace an impossible inertia by its mean, to see the rest of the model.
 
     Raises:
         InputError: no MJCF, or one that MuJoCo refuses.
@@ -121,7 +128,17 @@ def load_model(path: str | Path) -> mujoco.MjModel:
     document = markup.read(path, "mujoco")
     spec = _parse(document)
     _drop_looks(spec, document)
+    spec.compiler.balanceinertia |= balanceinertia
     return _compile(spec, document.path)
+
+
+def load_spec(path: str | Path) -> mujoco.MjSpec:
+    """A file as MuJoCo's parser has it, before compilation.
+
+    Raises:
+        InputError: no MJCF.
+    """
+    return _parse(markup.read(path, "mujoco"))
 
 
 def _parse(document: markup.Document) -> mujoco.MjSpec:
@@ -201,8 +218,8 @@ def _check_mesh(spec: mujoco.MjSpec, geom, document: markup.Document) -> None:
     file = document.path.parent / spec.meshdir / (named[0] if named else "")
     if not file.exists():
         raise InputError(
-            f"{document.path}: body {geom.parent.name!r} takes its inertia from mesh {geom.meshname!r}, and {file}"
-            " is missing; put the mesh there or give the body an <inertial>"
+            f"{document.path}: body {geom.parent.name!r} takes its inertia from mesh {geom.meshname!r},"
+            f" and {file} is missing; put the mesh there or give the body an <inertial>"
         )
 
 
@@ -226,7 +243,8 @@ def _serial_joints(model: mujoco.MjModel, path: Path) -> tuple[list[int], list[i
     while True:
         if model.body_jntnum[body] > 1:
             raise InputError(
-                f"{path}: {_body_name(model, body)} has {model.body_jntnum[body]} joints; give each joint a body"
+                f"{path}: {_body_name(model, body)} has {model.body_jntnum[body]} joints;"
+                " give each joint a body of its own"
             )
         joints.append(int(model.body_jntadr[body]))
         branches = _moving_children(model, body)
@@ -237,7 +255,8 @@ def _serial_joints(model: mujoco.MjModel, path: Path) -> tuple[list[int], list[i
         if _depth(model, branch) > min(FINGER_JOINTS, len(joints) - 1):
             others = " and ".join(_body_name(model, b) for b in branches[:2])
             raise InputError(
-                f"{path}: the arm branches at {_body_name(model, body)} into {others}; one serial arm is expected"
+                f"{path}: the arm branches at {_body_name(model, body)} into {others};"
+                " one serial arm is expected"
             )
     locked = [j for branch in branches for b in _subtree(model, branch) for j in _joints_of(model, b)]
     return joints, locked
@@ -317,7 +336,8 @@ def _check_actuators(model: mujoco.MjModel, joints: list[int], path: Path) -> No
         if np.any(loads) and not elsewhere:
             name = model.actuator(actuator).name or f"number {actuator + 1}"
             raise InputError(
-                f"{path}: actuator {name!r} has armature or damping of its own, which MJX ignores; give it to the joint"
+                f"{path}: actuator {name!r} has armature or damping of its own, which MJX ignores;"
+                " give it to the joint"
             )
 
 
@@ -335,8 +355,8 @@ def _check_tendons(model: mujoco.MjModel, joints: list[int], path: Path) -> None
         if np.any(loads) and _spans(model, tendon, joints):
             name = model.tendon(tendon).name or f"number {tendon + 1}"
             raise InputError(
-                f"{path}: tendon {name!r} puts stiffness, damping, friction or armature across joints of the arm;"
-                " give them to the joints"
+                f"{path}: tendon {name!r} puts stiffness, damping, friction or armature across joints"
+                " of the arm; give them to the joints"
             )
 
 
@@ -421,7 +441,9 @@ def _links(
         rotations.append(R if slides else R @ _turn_z(-q0))
         origins.append(p - q0 * R[:, 2] if slides else p)
 
-        phi = {b: _body_standard(model, b, pose[b], (R_wl, p_wl)) for b in np.flatnonzero(owner == body)}
+        phi = {
+            b: _body_standard(model, b, pose[b], (R_wl, p_wl)) for b in np.flatnonzero(owner == body).tolist()
+        }
         own = phi.pop(body)
         lumped = np.sum(list(phi.values()), 0) if phi else np.zeros(10)
         standard.append(own + lumped)
@@ -435,7 +457,7 @@ def _links(
                 qpos=int(model.jnt_qposadr[joint]),
                 R=R_bl,
                 p=p_bl,
-                lumped=tuple(model.body(int(b)).name or f"body{b}" for b in phi),
+                lumped=tuple(model.body(b).name or f"body{b}" for b in phi),
                 lumped_standard=lumped,
             )
         )

@@ -1,0 +1,115 @@
+"""An arm as URDF, for the tools that read no MJCF."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from .arm import Arm
+from .friction import Friction
+from .markup import quote
+from .mjcf import com_from_standard
+
+UNLIMITED = 1e6
+"""Written for an effort [N m] or velocity [rad/s] that the arm does not tell: URDF demands a number."""
+
+
+def to_urdf(
+    arm: Arm,
+    standard: Float[Array, "dof 10"] | Float[np.ndarray, "dof 10"] | None = None,
+    friction: Friction | None = None,
+    *,
+    effort: Float[np.ndarray, " dof"] | None = None,
+    velocity: Float[np.ndarray, " dof"] | None = None,
+) -> str:
+    """URDF of the arm: links, joints, limits and friction.
+
+    Every link's frame is the arm's, with its joint along z. URDF has no gravity, no armature, no springs and no
+    constant torque; a comment in the file says which of them were left out.
+
+    Args:
+        arm: geometry, limits, and the friction that its model holds already.
+        standard: parameters of the links; None for the arm's own.
+        friction: found beyond what `arm` holds; only viscous and Coulomb friction have a home.
+        effort: largest torque of each joint [N m].
+        velocity: largest velocity of each joint [rad/s].
+    """
+    phi = np.asarray(arm.standard if standard is None else standard, float)
+    found = friction if friction is not None and friction.model not in ("none", "sigmoid") else None
+    damping = np.asarray(arm.damping, float) + (found.viscous if found else 0)
+    coulomb = np.asarray(arm.frictionloss, float) + (found.coulomb if found else 0)
+    effort = np.full(arm.dof, UNLIMITED) if effort is None else effort
+    velocity = np.full(arm.dof, UNLIMITED) if velocity is None else velocity
+    lines = [f'<robot name="{quote(arm.name)}">', *_left_out(arm, friction), f'  <link name="{_base(arm)}"/>']
+    parents = (_base(arm), *arm.link_names)
+    for i in range(arm.dof):
+        lines += _link(arm.link_names[i], phi[i])
+        kind = "prismatic" if arm.chain.prismatic[i] else "revolute"
+        lower, upper = float(arm.lower[i]), float(arm.upper[i])
+        limits = f'effort="{_numbers(effort[i])}" velocity="{_numbers(velocity[i])}"'
+        if np.isfinite(lower) and np.isfinite(upper):
+            limits = f'lower="{_numbers(lower)}" upper="{_numbers(upper)}" {limits}'
+        elif kind == "revolute":
+            kind = "continuous"
+        else:
+            limits = f'lower="{-UNLIMITED}" upper="{UNLIMITED}" {limits}'
+        lines += [
+            f'  <joint name="{quote(arm.joint_names[i])}" type="{kind}">',
+            f'    <parent link="{quote(parents[i])}"/>',
+            f'    <child link="{quote(arm.link_names[i])}"/>',
+            f'    <origin xyz="{_numbers(arm.chain.p[i])}" rpy="{_numbers(_rpy(np.asarray(arm.chain.R[i], float)))}"/>',
+            '    <axis xyz="0 0 1"/>',
+            f"    <limit {limits}/>",
+            f'    <dynamics damping="{_numbers(damping[i])}" friction="{_numbers(coulomb[i])}"/>',
+            "  </joint>",
+        ]
+    return "\n".join([*lines, "</robot>", ""])
+
+
+def _link(name: str, phi: np.ndarray) -> list[str]:
+    """A link with its inertia about the centre of mass, in URDF's order ixx ixy ixz iyy iyz izz."""
+    if phi[0] == 0:
+        return [f'  <link name="{quote(name)}"/>']
+    mass, com, I = com_from_standard(phi)
+    entries = zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), I[np.triu_indices(3)], strict=True)
+    inertia = " ".join(f'{key}="{_numbers(value)}"' for key, value in entries)
+    return [
+        f'  <link name="{quote(name)}">',
+        "    <inertial>",
+        f'      <origin xyz="{_numbers(com)}" rpy="0 0 0"/>',
+        f'      <mass value="{_numbers(mass)}"/>',
+        f"      <inertia {inertia}/>",
+        "    </inertial>",
+        "  </link>",
+    ]
+
+
+def _left_out(arm: Arm, friction: Friction | None) -> list[str]:
+    """A comment naming what the URDF does not hold."""
+    parts = []
+    if np.any(np.asarray(arm.armature)):
+        parts.append("armature " + _numbers(arm.armature))
+    if np.any(np.asarray(arm.stiffness)):
+        parts.append("joint springs " + _numbers(arm.stiffness) + " about " + _numbers(arm.springref))
+    if friction is not None and friction.model == "sigmoid":
+        parts.append("sigmoid friction")
+    elif friction is not None and np.any(friction.offset):
+        parts.append("torque offsets " + _numbers(friction.offset))
+    return [f"  <!-- not in this file: {'; '.join(parts)} -->"] if parts else []
+
+
+def _base(arm: Arm) -> str:
+    return "base_link" if "base_link" not in arm.link_names else "world"
+
+
+def _rpy(R: np.ndarray) -> np.ndarray:
+    """Roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll), exact to rounding also at pitch = ±90 degrees."""
+    yaw = np.arctan2(R[1, 0], R[0, 0]) if R[0, 0] or R[1, 0] else 0.0
+    c, s = np.cos(yaw), np.sin(yaw)
+    pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return np.array([roll, pitch, yaw])
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(values))
