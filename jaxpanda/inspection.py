@@ -121,11 +121,11 @@ class Inspection:
                 str(joint.reversals),
                 f"{100 * joint.rest:.0f}",
                 _shown(joint.velocity_lag, 1e3, ".1f"),
-                _shown(joint.torque_step, 1, ".2g"),
-                _shown(joint.noise, 1, ".3f"),
-                _shown(joint.repeat_noise, 1, ".4f"),
-                _shown(joint.torque_scale, 1, ".3f"),
-                _shown(joint.gravity_scale, 1, ".3f"),
+                _shown(joint.torque_step, 1.0, ".2g"),
+                _shown(joint.noise, 1.0, ".3f"),
+                _shown(joint.repeat_noise, 1.0, ".4f"),
+                _shown(joint.torque_scale, 1.0, ".3f"),
+                _shown(joint.gravity_scale, 1.0, ".3f"),
             ]
             for joint in self.joints
         ]

@@ -9,7 +9,7 @@ $F\tau - F W\beta = F(\tau - W\beta)$: what the filter does at the edges it does
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -28,6 +28,7 @@ LONGEST_GAP = 0.1
 REPEATS = 0.02
 """A motion repeats where q differs by less than this share of its own spread (rms)."""
 _ORDER = 4  # of the Butterworth filter, before it runs back over its output
+_SHORTEST_PAD = 30  # samples, for cutoffs near half the rate
 _SEARCH_STEP = 0.02  # [s] at which repeated motion is looked for
 _PROMISING = (
     0.5  # share of the spread by which motions may differ, rms over start and stop, to be compared closely
@@ -112,10 +113,13 @@ def prepare(
     time, step, repairs, notes = _grid(recording)
     full_rate = 1 / step
     derivative_cutoff, notes = _cutoffs(recording.name, cutoff, derivative_cutoff, full_rate, notes)
-    q, qd, qdd = derivatives(_resample(recording.time, recording.q, time), derivative_cutoff, full_rate)
+    bridged = np.max(np.diff(recording.time)) > LONGEST_GAP
+    smooth = scipy.interpolate.PchipInterpolator if bridged else scipy.interpolate.CubicSpline
+    q = _resample(recording.time, recording.q, time, smooth)
+    q, qd, qdd = derivatives(q, derivative_cutoff, full_rate)
     tau = None if recording.tau is None else _resample(recording.time, recording.tau, time)
     trim = max(0.6, 1 / cutoff) if trim is None else trim
-    keep = _kept(recording, time, step, trim, min(rate or 100.0, full_rate))
+    keep = _kept(recording, time, step, trim, min(100.0 if rate is None else rate, full_rate))
     return Signals(
         name=recording.name,
         time=time,
@@ -141,7 +145,7 @@ def zero_phase(x: Float[np.ndarray, "time ..."], cutoff: float, rate: float) -> 
     this disturbs a position least.
     """
     sos = scipy.signal.butter(_ORDER, cutoff, fs=rate, output="sos")
-    pad = min(round(1.5 * rate / cutoff), len(x) - 1)
+    pad = min(max(round(1.5 * rate / cutoff), _SHORTEST_PAD), len(x) - 1)
     return scipy.signal.sosfiltfilt(sos, x, axis=0, padtype="odd", padlen=pad)
 
 
@@ -313,12 +317,19 @@ def _grid(recording: Recording) -> tuple[Float[np.ndarray, " time"], float, dict
 
 
 def _resample(
-    time: Float[np.ndarray, " row"], x: Float[np.ndarray, "row dof"], grid: Float[np.ndarray, " time"]
+    time: Float[np.ndarray, " row"],
+    x: Float[np.ndarray, "row dof"],
+    grid: Float[np.ndarray, " time"],
+    interpolate: Callable = scipy.interpolate.PchipInterpolator,
 ) -> Float[np.ndarray, "time dof"]:
-    """x on the grid: as it is where rows lie on the grid, else by piecewise cubic interpolation."""
+    """x on the grid: as it is where rows lie on the grid, else interpolated.
+
+    Torque is noisy: a monotone interpolation (PCHIP) cannot overshoot. Position is smooth: a cubic spline
+    bridges missing rows with a tenth of the error in acceleration, unless the bridge is long.
+    """
     if len(time) == len(grid) and np.allclose(time, grid, rtol=0, atol=1e-3 * (grid[1] - grid[0])):
         return x
-    return scipy.interpolate.PchipInterpolator(time, x)(np.clip(grid, time[0], time[-1]))
+    return interpolate(time, x)(np.clip(grid, time[0], time[-1]))
 
 
 def _cutoffs(

@@ -50,7 +50,7 @@ def _finite(recording: Recording, row: Callable[[int], str]) -> None:
         if bad.size:
             more = f" and {bad.size - 1} more below it" if bad.size > 1 else ""
             raise InputError(
-                f"{recording.name}: column {name}, {row(bad[0])}: the value is {column[bad[0]]}{more}, where "
+                f"{recording.name}: column {name}, {row(int(bad[0]))}: the value is {column[bad[0]]}{more}, where "
                 "a finite number is needed; leave out the rows that were not measured"
             )
 
@@ -58,7 +58,7 @@ def _finite(recording: Recording, row: Callable[[int], str]) -> None:
 def _ordered(recording: Recording, row: Callable[[int], str]) -> None:
     back = np.flatnonzero(np.diff(recording.time) <= 0)
     if back.size:
-        i = back[0] + 1
+        i = int(back[0]) + 1
         before, after = float(recording.time[i - 1]), float(recording.time[i])
         what = "repeats" if before == after else "goes back"
         raise InputError(

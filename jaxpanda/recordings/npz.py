@@ -1,6 +1,7 @@
 """NumPy archives: arrays `time` (n,), `q`, `dq` or `qd`, `tau` (n, dof)."""
 
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -54,7 +55,7 @@ def _arrays(path: Path, columns: Mapping[str, str] | None) -> dict[str, np.ndarr
             return {channel: _array(archive, channel, path, columns) for channel in _ALIASES}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (OSError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path.name}: no NumPy archive, or a broken one ({error})") from None
     except InputError:
         raise

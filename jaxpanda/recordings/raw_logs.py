@@ -19,7 +19,7 @@ from .text import numbers, read_text
 from .ticks import Ticks, consistent, reconstruct
 
 _WORDS = {
-    "time": {"time", "times", "stamp", "stamps", "timestamp", "timestamps", "t"},
+    "time": {"time", "times", "stamp", "stamps", "timestamp", "timestamps"},
     "q": {"position", "positions", "pos", "q"},
     "dq": {"velocity", "velocities", "vel", "dq", "qd"},
     "tau": {"torque", "torques", "tau", "effort", "efforts"},

@@ -109,7 +109,7 @@ def _period(time: Float[np.ndarray, " time"], elapsed: Float[np.ndarray, " row"]
 
 def _rests(moving: np.ndarray) -> list[tuple[int, int]]:
     """Spans [first, last) of steps at rest that have motion on both sides."""
-    edges = np.flatnonzero(np.diff(moving.astype(int)))
+    edges = np.flatnonzero(np.diff(moving.astype(int))).tolist()
     return [(a + 1, b + 1) for a, b in itertools.pairwise(edges) if not moving[a + 1]]
 
 

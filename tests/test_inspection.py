@@ -1,0 +1,161 @@
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxpanda_kernels import gravity_torque
+
+from jaxpanda.errors import InputError
+from jaxpanda.inspection import Inspection, inspect
+from jaxpanda.panda import panda
+from jaxpanda.recordings import Recording, load
+
+CENTRE = np.array([0.0, -0.3, 0.0, -1.8, 0.0, 1.8, 0.0])
+
+
+def excitation(time: np.ndarray) -> np.ndarray:
+    """A motion of all joints within the Panda's limits."""
+    rng = np.random.default_rng(0)
+    frequency, phase = rng.uniform(1.0, 5.0, (5, 7)), rng.uniform(0, 6, (5, 7))
+    return CENTRE + 0.4 * np.sum(np.sin(time[:, None, None] * frequency + phase) / frequency, axis=1)
+
+
+nominal = jax.jit(jax.vmap(panda().inverse_dynamics))
+
+
+def virtual(q=excitation, *, late: float = 0.0, noise: float = 0.02, rate: float = 250.0) -> Recording:
+    """What the Panda's own model would record of a motion, with velocities logged late."""
+    time = np.arange(round(12 * rate)) / rate
+    h = 1e-4
+    qd = (q(time + h) - q(time - h)) / (2 * h)
+    qdd = (q(time + h) - 2 * q(time) + q(time - h)) / h**2
+    tau = np.array(nominal(*map(jnp.asarray, (q(time), qd, qdd))))
+    tau += noise * np.random.default_rng(1).normal(size=tau.shape) + 0.2 * np.tanh(qd / 0.05)
+    logged = (q(time - late + h) - q(time - late - h)) / (2 * h)
+    return Recording("virtual", time, q(time), logged, tau)
+
+
+def said(found: Inspection) -> str:
+    return "\n".join(found.verdicts)
+
+
+def test_a_clean_recording_is_found_right_in_every_respect():
+    found = inspect(virtual(late=5e-3), panda())
+    assert found.channels == ("q", "dq", "tau")
+    assert (found.dof, found.samples, found.missing, found.repeated_rows, found.gaps) == (7, 3000, 0, 0, ())
+    assert found.rate == pytest.approx(250.0)
+    assert found.velocity_scale == pytest.approx(1.0, abs=0.02)
+    assert found.identifiable is not None
+    assert (found.identifiable.rank, found.identifiable.structural_rank) == (43, 43)
+    assert (found.identifiable.gravity_rank, found.identifiable.gravity_structural_rank) == (12, 12)
+    assert found.identifiable.coulomb_joints == tuple(range(1, 8))
+    assert "torque in N m, positive along the joint axis" in said(found)
+    assert "gravity is in the torque" in said(found)
+    for joint in found.joints:
+        assert joint.velocity_lag == pytest.approx(5e-3, abs=2e-4)
+        assert joint.noise == pytest.approx(0.02, rel=0.1)
+        assert joint.reversals > 3
+        assert joint.torque_scale is None or joint.torque_scale == pytest.approx(1.0, abs=0.03)
+    assert sum(joint.torque_scale is not None for joint in found.joints) >= 4
+
+
+def test_a_reversed_torque_is_noticed():
+    good = virtual()
+    assert good.tau is not None
+    found = inspect(Recording("reversed", good.time, good.q, good.qd, -good.tau), panda())
+    assert "wrong sign" in said(found)
+    assert "torque in N m, positive" not in said(found)
+
+
+def test_one_reversed_joint_is_named():
+    good = virtual()
+    assert good.tau is not None
+    found = inspect(Recording("one", good.time, good.q, good.qd, good.tau * [1, 1, 1, -1, 1, 1, 1]), panda())
+    assert "wrong sign on joints 4:" in said(found)
+
+
+def test_a_torque_in_other_units_is_noticed():
+    good = virtual()
+    assert good.tau is not None
+    found = inspect(Recording("millinewtons", good.time, good.q, good.qd, 1000 * good.tau), panda())
+    assert "times what the model needs: check its unit" in said(found)
+
+
+def test_gravity_taken_out_by_the_controller_is_noticed():
+    good, arm = virtual(), panda()
+    assert good.tau is not None
+    gravity = jax.vmap(lambda q: gravity_torque(arm.chain, arm.standard, q))(jnp.asarray(good.q))
+    found = inspect(Recording("free", good.time, good.q, good.qd, good.tau - np.asarray(gravity)), arm)
+    assert "gravity is not in the torque" in said(found)
+
+
+def test_a_joint_that_rests_is_named_and_shows_less():
+    def held(time):
+        return np.where(np.arange(7) == 2, CENTRE, excitation(time))
+
+    found = inspect(virtual(held), panda())
+    assert found.joints[2].rest == 1.0
+    assert found.joints[2].reversals == 0
+    assert "joints 3 hardly move" in said(found)
+    assert found.identifiable is not None
+    assert 3 not in found.identifiable.coulomb_joints
+    assert found.identifiable.rank < 43
+
+
+def test_a_motion_outside_the_model_s_limits_is_noticed():
+    found = inspect(virtual(lambda t: excitation(t) + 2.5 * np.eye(7)[3]), panda())
+    assert "joint 4 goes from" in said(found)
+
+
+def test_a_motion_and_a_missing_model_are_said():
+    good = virtual()
+    assert "a motion, which can be predicted for" in said(inspect(Recording("m", good.time, good.q), panda()))
+    found = inspect(good)
+    assert found.identifiable is None
+    assert "cannot be told without a model" in said(found)
+
+
+def test_gaps_repeats_and_jitter_are_counted():
+    good = virtual()
+    assert good.tau is not None
+    rows = np.r_[0:1000, 1060:3000]
+    q, tau = good.q[rows].copy(), good.tau[rows].copy()
+    q[500:600:2], tau[500:600:2] = q[499:599:2], tau[499:599:2]
+    found = inspect(Recording("gappy", good.time[rows], q, None, tau), panda())
+    assert found.missing == 60
+    assert found.repeated_rows == 50
+    assert found.gaps[0] == (pytest.approx(3.996), pytest.approx(0.244))
+    assert "gaps longer than 0.1 s, the longest 0.244 s at 3.996 s" in said(found)
+    assert "rows repeat the one before" in said(found)
+    assert "time is not uniform" in said(found)
+
+
+def test_an_arm_with_another_number_of_joints_is_refused():
+    good = virtual()
+    with pytest.raises(InputError, match=r"6 joints .* where the model has 7"):
+        inspect(Recording("six", good.time, good.q[:, :6]), panda())
+
+
+def test_everything_is_plain_json_and_fits_a_table():
+    found = inspect(virtual(), panda())
+    document = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert document["schema"] == "jaxpanda.inspection/1"
+    assert len(document["joints"]) == 7
+    heads, rows = found.table()
+    assert len(rows) == 7
+    assert all(len(row) == len(heads) for row in rows)
+    assert all(verdict in found.lines() for verdict in found.verdicts)
+
+
+def test_the_log_of_gaz_et_al_is_what_the_notes_say(data):
+    found = inspect(load(data / "gaz_panda"), panda())
+    assert found.identifiable is not None
+    assert found.identifiable.rank == 43
+    lags = [joint.velocity_lag for joint in found.joints]
+    assert all(lag is not None and 4.3e-3 < lag < 6.2e-3 for lag in lags)
+    steps = [joint.torque_step for joint in found.joints]
+    assert np.allclose(steps, [0.0357] * 4 + [0.0055, 0.0064, 0.0064], atol=2e-4)
+    assert all(joint.torque_scale is None or 0.9 < joint.torque_scale < 1.1 for joint in found.joints)
+    assert found.period == pytest.approx(13.3335, abs=1e-3)
+    assert "gravity is in the torque" in said(found)
