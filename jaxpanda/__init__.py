@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .arm import Arm as Arm
     from .demo import demonstrate as demonstrate
     from .errors import InputError as InputError
-    from .export import to_mjcf as to_mjcf
+    from .pipeline import to_mjcf as to_mjcf
     from .feasible import Bounds as Bounds
     from .identification import Identification as Identification
     from .identification import identify as identify
@@ -49,7 +49,7 @@ _HOME = {
     "retrieve": "retrieval",
     "save": "recordings",
     "simulate": "simulation",
-    "to_mjcf": "export",
+    "to_mjcf": "pipeline",
     "validate": "validation",
 }
 __all__ = [*_HOME]  # noqa: PLE0604

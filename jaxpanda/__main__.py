@@ -84,7 +84,17 @@ class Identify:
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.identify_files(self)
+        return pipeline.identify_files(
+            self.out,
+            self.recording,
+            self.mass_gravity,
+            self.model,
+            method=self.method,
+            friction=self.friction,
+            weighting=self.weighting,
+            cutoff=self.cutoff,
+            folds=self.folds,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,13 +112,23 @@ class Retrieve:
     """CSV with name, lower, upper for each link parameter; without it, the published bounds of the Panda."""
     model: Path | None = None
     """The arm (MJCF) that bounds are set around when it is not the Panda and --bounds is absent."""
+    weighting: Literal["none", "covariance"] = "none"
+    """All coefficients alike, as the paper has it, or each by how sure it is."""
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.retrieve_files(self)
+        return pipeline.retrieve_files(
+            self.out,
+            self.identification,
+            self.bounds,
+            self.model,
+            weighting=self.weighting,
+            starts=self.starts,
+            seed=self.seed,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,7 +147,9 @@ class Export:
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.export_files(self)
+        from .retrieval import Retrieval
+
+        return pipeline.to_mjcf(Retrieval.load(self.retrieval), self.out, self.model)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,7 +170,7 @@ class Validate:
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.validate_files(self)
+        return pipeline.validate_files(self.out, self.model, self.recording, cutoff=self.cutoff)
 
 
 _COMMANDS = (Demo, Inspect, Identify, Retrieve, Export, Validate)

@@ -6,10 +6,15 @@ ways to read it. The page needs no network: figures are SVG inside it.
 
 import dataclasses
 import io
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from .files import write_text
+
+
+_PIPED_WIDTH = 200
+"""Columns of text that goes to a file or a pipe; a terminal knows its own width."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +56,7 @@ def to_terminal(sections: Sequence[Section]) -> None:
     from rich.console import Console
     from rich.markup import escape
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else _PIPED_WIDTH)
     for section in sections:
         console.print(f"\n[bold]{escape(section.heading)}[/bold]")
         for sentence in section.sentences:

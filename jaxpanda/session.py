@@ -18,7 +18,7 @@ def start() -> None:
     """
     jax.config.update("jax_enable_x64", True)
     folder = os.environ.get("JAXPANDA_CACHE", str(Path.home() / ".cache" / "jaxpanda"))
-    if folder and jax.config.read("jax_compilation_cache_dir") is None:
+    if folder and jax.config.jax_compilation_cache_dir is None:
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 

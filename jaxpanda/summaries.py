@@ -1,0 +1,200 @@
+"""Every stage's result in sentences, tables and figures: once, for the terminal and for the page."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from .report import Figure, Section, Table, number
+
+
+def of(result: Any) -> Sequence[Section]:
+    """The sections that say what a stage found."""
+    return _SUMMARIES[type(result).__name__](result)
+
+
+def inspections(result: Any) -> Sequence[Section]:
+    """One section a recording."""
+    return [inspection(one) for one in result.recordings]
+
+
+def inspection(one: Any) -> Section:
+    """Facts and verdicts of one recording; a column a joint, so that it fits a terminal."""
+    heads, rows = one.table()
+    columns = [heads[0], *(row[0] for row in rows)]
+    quantities = [[head, *(row[k] for row in rows)] for k, head in enumerate(heads) if k]
+    return Section(f"Recording {one.name}", one.lines(), [Table(columns, quantities)])
+
+
+def identification(found: Any) -> Sequence[Section]:
+    """Coefficients with their deviations, friction, and what is left unexplained."""
+    names = found.joint_names or [f"joint {i + 1}" for i in range(found.dof)]
+    sentences = [
+        f"{len(found.beta)} base parameters (rank {found.rank}, condition number "
+        f"{number(found.condition_number)}) leave {number(found.relative_error_percent)} % of the data unexplained."
+    ]
+    if found.cross_validated_relative_error_percent is not None:
+        sentences.append(
+            f"On motion it had not seen, nor any repeat of it: "
+            f"{number(found.cross_validated_relative_error_percent)} %."
+        )
+    sentences += _repairs(found.repairs) + list(found.notes)
+    tables = [_coefficients(found)]
+    if found.friction is not None and found.friction.parameters:
+        tables.append(_friction(found.friction, names))
+    if found.rmse is not None:
+        tables.append(
+            _by_joint(
+                "Torque error at each joint [N m]",
+                names,
+                {"fitted": found.rmse, "held out": found.cross_validated_rmse, "noise floor": found.noise},
+            )
+        )
+    return [Section("Identification", sentences, tables)]
+
+
+def _coefficients(found: Any) -> Table:
+    rows = []
+    for row in found.coefficients:
+        std = row.get("std")
+        share = "–" if std is None or row["value"] == 0 else f"{100 * std / abs(row['value']):.2g} %"
+        mark = "" if row["reliable"] else "unreliable"
+        rows.append([row["expression"], f"{row['value']:.6g}", number(std, 2), share, mark])
+    return Table(["coefficient", "value", "std", "std/value", ""], rows, "Base parameters [kg m², kg m]")
+
+
+def _friction(friction: Any, names: Sequence[str]) -> Table:
+    from .friction import UNITS
+
+    columns = ["joint"]
+    cells: list[list[str]] = [[name] for name in names]
+    for parameter, values in friction.parameters.items():
+        columns.append(f"{parameter} [{UNITS[parameter]}]")
+        deviations = None if friction.std is None else friction.std.get(parameter)
+        for i, value in enumerate(values):
+            spread = "" if deviations is None or not np.isfinite(deviations[i]) else f" ± {deviations[i]:.2g}"
+            cells[i].append(f"{value:.4g}{spread}")
+    return Table(columns, cells, f"Friction beyond the model: {friction.model}")
+
+
+def retrieval(links: Any) -> Sequence[Section]:
+    """Links that could be built, and what torque cannot tell about them."""
+    document = links.to_json()
+    best = document["objective"]
+    sentences = [
+        f"The best of {document['starts']} random starts misses the coefficients by phi = {best:.6g}; "
+        f"largest violation of any constraint {document['max_violation']:.2g}; "
+        f"total mass {document['total_mass']:.2f} kg."
+    ]
+    if document["lower_bound"] is not None:
+        sentences.append(f"No feasible links can do better than {document['lower_bound']:.6g} (convex certificate).")
+    seconds = document["seconds"]
+    sentences.append(f"{seconds['compile']:.1f} s to compile, {seconds['run']:.1f} s to run.")
+    rows = [
+        [
+            link["name"],
+            f"{link['mass']:.4f}",
+            *(f"{x:.4f}" for x in link["com"]),
+            *(f"{x:.5f}" for x in link["inertia"]),
+        ]
+        for link in document["links"]
+    ]
+    heads = ["link", "m kg", "cx m", "cy m", "cz m", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"]
+    return [
+        Section(
+            "Retrieval of feasible links",
+            sentences,
+            [Table(heads, rows, "In each link's modified Denavit-Hartenberg frame; inertia about the centre of mass [kg m²]")],
+        )
+    ]
+
+
+def export(written: Any) -> Sequence[Section]:
+    """What an export changed."""
+    sentences = [f"Wrote {written.path}.", *written.warnings]
+    rows = [
+        [f"{change.file}:{change.line}", change.element, change.attribute, change.old or "–", change.new or "–"]
+        for change in written.changes
+    ]
+    tables = [Table(["where", "element", "attribute", "was", "is"], rows)] if rows else []
+    return [Section("Export", sentences, tables)]
+
+
+def validation(checked: Any) -> Sequence[Section]:
+    """Agreement of three inverse dynamics, torque error and tracking."""
+    document = checked.to_json()
+    sentences = [
+        "Largest difference of inverse dynamics on the recorded states: kernel against MuJoCo "
+        f"{number(document['kernel_vs_mujoco'], 2)} N m, MJX against MuJoCo {number(document['mjx_vs_mujoco'], 2)} N m.",
+        f"Torque error on the recording: {number(document['relative_error_percent'])} %.",
+        *document.get("notes", []),
+    ]
+    columns: dict[str, Any] = {"torque rmse [N m]": document["rmse"]}
+    if document.get("rollout_rmse_rad"):
+        columns["tracking in MJX, rmse [rad]"] = document["rollout_rmse_rad"]
+    names = document.get("joints") or [f"joint {i + 1}" for i in range(len(document["rmse"]))]
+    return [Section("Validation", sentences, [_by_joint("", names, columns)])]
+
+
+def _by_joint(caption: str, names: Sequence[str], columns: Mapping[str, Any]) -> Table:
+    present = {head: values for head, values in columns.items() if values is not None and len(values)}
+    rows = [[name, *(number(values[i]) for values in present.values())] for i, name in enumerate(names)]
+    return Table(["joint", *present], rows, caption)
+
+
+def _repairs(repairs: Mapping[str, int]) -> list[str]:
+    return ["In the data: " + "; ".join(f"{what}: {count}" for what, count in repairs.items()) + "."] if repairs else []
+
+
+def torque_figure(
+    time: Float[np.ndarray, " time"],
+    curves: Mapping[str, Float[np.ndarray, "time dof"]],
+    names: Sequence[str],
+    caption: str,
+) -> Figure:
+    """Torques of every joint over time; the second curve's difference from the first below each."""
+
+    def draw(canvas: Any) -> None:
+        dof = len(names)
+        axes = canvas.subplots(dof, 2, sharex=True, squeeze=False, width_ratios=[2, 1])
+        thin = max(1, len(time) // 1500)
+        measured = next(iter(curves.values()))
+        for j in range(dof):
+            for k, (label, values) in enumerate(curves.items()):
+                axes[j, 0].plot(time[::thin], values[::thin, j], label=label, color=f"C{k}")
+                if k:
+                    axes[j, 1].plot(time[::thin], (measured - values)[::thin, j], color=f"C{k}", label=label)
+            axes[j, 0].set_ylabel(f"{names[j]} [N m]")
+        axes[0, 0].legend(loc="upper right", ncols=len(curves))
+        axes[0, 0].set_title("torque")
+        axes[0, 1].set_title("what is left")
+        for axis in axes[-1]:
+            axis.set_xlabel("time [s]")
+
+    return Figure(draw, caption, size=(10.0, 1.5 * len(names)))
+
+
+def outcome_figure(objective: Float[np.ndarray, " start"], lower_bound: float | None) -> Figure:
+    """Objective of every start, sorted: how many reach the optimum."""
+
+    def draw(canvas: Any) -> None:
+        axis = canvas.subplots()
+        share = np.linspace(0, 100, len(objective))
+        axis.semilogy(share, np.sort(objective), label="starts, sorted")
+        if lower_bound is not None:
+            axis.axhline(lower_bound, color="C3", linestyle="--", label="certified lower bound")
+        axis.set(xlabel="share of starts [%]", ylabel="objective")
+        axis.legend()
+
+    return Figure(draw, "Objective of every random start", size=(7.0, 3.0))
+
+
+_SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
+    "Inspections": inspections,
+    "Identification": identification,
+    "Retrieval": retrieval,
+    "Export": export,
+    "Validation": validation,
+    "Demonstration": lambda result: result.sections,
+}
