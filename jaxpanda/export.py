@@ -31,11 +31,13 @@ from jaxtyping import Array, Float
 from . import markup
 from .arm import Arm
 from .errors import InputError
-from .files import write_text, to_json
+from .files import to_json, write_text
 from .friction import Friction
 from .lint import ignored_by_mjx
+from .markup import numbers
 from .mjcf import MjcfLink, MjcfSource, com_from_standard, from_document, move_standard, standard_from_com
 from .panda import panda, published
+from .urdf import to_urdf as to_urdf
 
 SIDECAR = "jaxpanda.sidecar/1"
 TORQUE_LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
@@ -145,7 +147,7 @@ def write_parameters(
     standard: Float[Array, "dof 10"] | Float[np.ndarray, "dof 10"] | None = None,
     friction: Friction | None = None,
 ) -> ExportResult:
-    r"""The user's file as the model $Y\phi$ + `arm.known_torque` + `friction`, and nothing else of it touched.
+    r"""The user's file as the model $Y\phi$ + `arm.known_torque` + `friction`, and no other byte touched.
 
     The parameters of a link go into the `inertial` of its own body, less what the bodies lumped into it carry
     already: those keep theirs. Joints get the armature, springs and friction of `arm`, plus `friction`, which
@@ -173,14 +175,14 @@ def write_parameters(
             if not _agree(target, meant[i], np.asarray(standard)):
                 meant[i], edit = _inertial_edit(source, link, bodies[i], target, warnings)
                 edits.append(edit)
-    joints = _joint_values(arm, friction, warnings)
+    joints = _joint_values(arm, friction)
     edits += _joint_edits(source, bodies, before, joints)
     edited = markup.edit(source.document, edits)
     _verify(source, edited, meant, joints)
     return ExportResult(
         text=edited.text,
         changes=tuple(change for edit in edits for change in _changes(edit)),
-        warnings=(*warnings, *ignored_by_mjx(source.model)),
+        warnings=(*warnings, *not_held(arm, friction), *ignored_by_mjx(source.model)),
         sidecar=sidecar(arm, friction),
         document=edited,
     )
@@ -195,8 +197,8 @@ def _check_geometry(source: MjcfSource, before: Arm, arm: Arm) -> None:
         same = same and np.allclose(a[1:], b[1:], atol=1e-5)
     if not same:
         raise InputError(
-            f"{source.path}: its joint axes stand elsewhere than those of {arm.name!r}, which the parameters are"
-            " for; identify with this file as --model"
+            f"{source.path}: its joint axes stand elsewhere than those of {arm.name!r}, which the"
+            " parameters are for; identify with this file as --model"
         )
 
 
@@ -207,8 +209,8 @@ def _check_inertials_count(source: MjcfSource) -> None:
             value = element.attributes.get(name) if element.tag == "compiler" else None
             if value is not None and value not in harmless:
                 raise InputError(
-                    f"{element.file}: line {element.line}: compiler {name}={value!r} overrides every <inertial>;"
-                    " take it out first"
+                    f"{element.file}: line {element.line}: compiler {name}={value!r} overrides"
+                    " every <inertial>; take it out first"
                 )
 
 
@@ -283,30 +285,40 @@ def _buildable(
     return mass, com, moments.sum() * np.eye(3) - (axes * moments) @ axes.T
 
 
-def _joint_values(arm: Arm, friction: Friction | None, warnings: list[str]) -> dict[str, np.ndarray]:
+def not_held(arm: Arm, friction: Friction | None) -> tuple[str, ...]:
+    """What MuJoCo's joints cannot hold of the arm's own friction and that found beyond it, a sentence each."""
+    if friction is None or friction.model == "none":
+        return ()
+    sentences = []
+    for name, values in _laws(arm, friction).items():
+        for joint in np.flatnonzero(values < 0):
+            sentences.append(
+                f"{name} of {arm.joint_names[joint]} came out as {values[joint]:.4g}, which would feed energy into"
+                " the joint; 0 was written, the number is in the sidecar"
+            )
+    if friction.model == "sigmoid":
+        sentences.append("MuJoCo has no sigmoid friction: its level at speed was written as frictionloss")
+    if np.any(friction.offset):
+        sentences.append("MuJoCo's joints hold no constant torque: friction offsets are in the sidecar only")
+    return tuple(sentences)
+
+
+def _joint_values(arm: Arm, friction: Friction | None) -> dict[str, np.ndarray]:
     """MJCF's joint attributes, in SI units, for the arm's own physics and the friction beyond it."""
+    laws = _laws(arm, friction)
+    if friction is not None:
+        laws = {name: np.maximum(values, 0) for name, values in laws.items()}
+    own = {name: np.asarray(getattr(arm, name)) for name in ("armature", "stiffness", "springref")}
+    return own | laws
+
+
+def _laws(arm: Arm, friction: Friction | None) -> dict[str, np.ndarray]:
+    """Viscous and Coulomb friction of the arm and beyond it together, as it came out."""
     viscous, coulomb = _beyond(arm.dof, friction)
-    values = {
-        "armature": np.asarray(arm.armature),
+    return {
         "damping": np.asarray(arm.damping) + viscous,
         "frictionloss": np.asarray(arm.frictionloss) + coulomb,
-        "stiffness": np.asarray(arm.stiffness),
-        "springref": np.asarray(arm.springref),
     }
-    if friction is None:
-        return values
-    for name in ("damping", "frictionloss"):
-        for joint in np.flatnonzero(values[name] < 0):
-            warnings.append(
-                f"{name} of {arm.joint_names[joint]} came out as {values[name][joint]:.4g}, which would feed"
-                " energy into the joint; 0 was written, the number is in the sidecar"
-            )
-        values[name] = np.maximum(values[name], 0)
-    if friction.model == "sigmoid":
-        warnings.append("MuJoCo has no sigmoid friction: its level at speed was written as frictionloss")
-    if np.any(friction.offset):
-        warnings.append("MuJoCo's joints hold no constant torque: the friction offsets are in the sidecar only")
-    return values
 
 
 def _beyond(dof: int, friction: Friction | None) -> tuple[np.ndarray, np.ndarray]:
@@ -322,7 +334,7 @@ def _joint_edits(
     source: MjcfSource, bodies: Sequence[markup.Element], before: Arm, joints: Mapping[str, np.ndarray]
 ) -> list[markup.Edit]:
     edits = []
-    for i, (link, body) in enumerate(zip(source.links, bodies, strict=True)):
+    for i, body in enumerate(bodies):
         values = {}
         for name, value in joints.items():
             unused = name == "springref" and joints["stiffness"][i] == 0
@@ -368,8 +380,8 @@ def _verify(
             unused = name == "springref" and joints["stiffness"][i] == 0
             if not unused and abs(got[i] - value[i]) > 1e-12 * abs(value[i]) + float(np.finfo(got.dtype).eps):
                 raise InputError(
-                    f"{source.path}: joint {link.joint!r} compiles to {name} {got[i]:.6g}, not {value[i]:.6g};"
-                    " does springdamper, or a flag of <option>, decide it?"
+                    f"{source.path}: joint {link.joint!r} compiles to {name} {got[i]:.6g}, not"
+                    f" {value[i]:.6g}; does springdamper, or a flag of <option>, decide it?"
                 )
     changed = _others_changed(source, after.model)
     if changed:
@@ -384,10 +396,10 @@ _WRITTEN = {
 }
 """Arrays of MjModel that an export writes, in the rows of the arm."""
 _FOLLOWS = (
-    *("body_subtreemass", "body_invweight0", "body_sameframe", "body_simple", "dof_invweight0", "dof_M0", "dof_length"),
-    *("dof_simplenum", "geom_sameframe", "site_sameframe", "cam_poscom0", "light_poscom0", "tendon_invweight0"),
-    *("flexedge_invweight0", "actuator_acc0", "actuator_biasprm", "actuator_lengthrange", "signature"),
-)
+    "body_subtreemass body_invweight0 body_sameframe body_simple geom_sameframe site_sameframe dof_invweight0"
+    " dof_M0 dof_length dof_simplenum tendon_invweight0 flexedge_invweight0 cam_poscom0 light_poscom0"
+    " actuator_acc0 actuator_biasprm actuator_lengthrange"
+).split()
 """Arrays that MuJoCo computes from those."""
 _LAYOUT = ("bvh_", "body_bvh", "M_", "B_", "D_", "mapM", "mapD", "efm", "names", "dof_Madr")
 """How MuJoCo arranges its work."""
@@ -466,11 +478,6 @@ def _missing_assets(document: markup.Document, folder: Path) -> tuple[str, ...]:
     )
 
 
-def numbers(values: Any) -> str:
-    """Numbers as MJCF has them, every digit of the float64."""
-    return " ".join(repr(float(value)) for value in np.ravel(values))
-
-
 def _full(I: np.ndarray) -> list[float]:
     """MJCF's order of a symmetric tensor: xx yy zz xy xz yz."""
     return [I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]]
@@ -488,7 +495,7 @@ def panda_mjcf(
 
     Args:
         standard: parameters of the links; None for the published ones.
-        friction: as far as MuJoCo holds it; `sidecar` has the rest.
+        friction: as far as MuJoCo holds it; `not_held` says what it does not, `sidecar` has it.
         name: of the model.
 
     Raises:
@@ -497,7 +504,7 @@ def panda_mjcf(
     with jax.enable_x64(True):
         arm = jax.tree.map(np.asarray, panda())
     phi = np.asarray(arm.standard if standard is None else standard, float)
-    joints = _joint_values(arm, friction, [])
+    joints = _joint_values(arm, friction)
     timestep = 0.001
     alpha = np.deg2rad(published()["modified_dh"]["alpha_degrees"])
     origins = np.round(arm.chain.p, 15) + 0.0
@@ -510,14 +517,15 @@ def panda_mjcf(
         laws |= dry_friction(timestep) if "frictionloss" in laws else {}
         extra = "".join(f' {key}="{value}"' for key, value in laws.items())
         turn = numbers([1, np.round(np.tan(alpha[i] / 2), 15), 0, 0])
+        body = f'pos="{numbers(com)}" mass="{numbers(mass)}" fullinertia="{numbers(_full(I_com))}"'
         opening += (
             f'{pad}<body name="{arm.link_names[i]}" pos="{numbers(origins[i])}" quat="{turn}">\n'
-            f'{pad}  <inertial pos="{numbers(com)}" mass="{numbers(mass)}" fullinertia="{numbers(_full(I_com))}"/>\n'
+            f"{pad}  <inertial {body}/>\n"
             f'{pad}  <joint name="joint{i + 1}" range="{numbers([arm.lower[i], arm.upper[i]])}"{extra}/>\n'
             f"{pad}  {_capsule(ends[i])}\n"
         )
         closing = f"{pad}</body>\n" + closing
-    opening += f'{pad}  <site name="flange" pos="{numbers(ends[-1])}"/>\n'
+    opening += f'{"  " * (arm.dof + 3)}<site name="flange" pos="{numbers(ends[-1])}"/>\n'
     motors = "".join(
         f'    <motor name="motor{i + 1}" joint="joint{i + 1}" ctrlrange="{-limit} {limit}"/>\n'
         for i, limit in enumerate(TORQUE_LIMITS)

@@ -78,7 +78,7 @@ def _impossible_inertias(path: Path) -> list[Finding]:
     findings = []
     if spec.compiler.balanceinertia:
         findings.append(
-            Finding("warning", "compiler", "balanceinertia replaces an impossible inertia by its mean, silently")
+            Finding("warning", "compiler", "balanceinertia silently replaces an impossible inertia")
         )
     for body in spec.bodies:
         if not body.explicitinertial:
@@ -95,8 +95,8 @@ def _impossible_inertias(path: Path) -> list[Finding]:
                 Finding(
                     "error",
                     f"body {body.name!r}",
-                    f"principal moments {a}, {b}, {c} kg m² are no body's: none may be negative, or exceed the sum"
-                    " of the other two",
+                    f"principal moments {a}, {b}, {c} kg m² are no body's: none may be negative,"
+                    " or exceed the sum of the other two",
                 )
             )
     return findings
@@ -125,8 +125,8 @@ def _outliers(model: mujoco.MjModel) -> Iterator[Finding]:
                     yield Finding(
                         "warning",
                         _of(model, dof),
-                        f"{name} is {values[dof]:.6g}, {values[dof] / others.max():.1f} times the largest of the"
-                        f" other joints' ({others.max():.6g}); a slip of a digit?",
+                        f"{name} is {values[dof]:.6g}, {values[dof] / others.max():.1f} times the largest"
+                        f" of the other joints' ({others.max():.6g}); a slip of a digit?",
                     )
 
 
@@ -139,8 +139,8 @@ def _armature(model: mujoco.MjModel) -> Iterator[Finding]:
                 yield Finding(
                     "notice",
                     _of(model, dof),
-                    f"armature {armature:.4g} kg m² is {100 * armature / inertia[dof]:.0f} % of the joint's inertia"
-                    " at mid-range: the links beyond it hardly matter to its motion",
+                    f"armature {armature:.4g} kg m² is {100 * armature / inertia[dof]:.0f} % of the joint's"
+                    " inertia at mid-range: the links beyond it hardly matter to its motion",
                 )
 
 
@@ -158,7 +158,7 @@ def _placeholders(model: mujoco.MjModel) -> Iterator[Finding]:
                 yield Finding(
                     "notice",
                     f"{_of(model, dofs[0])} to {_of(model, dofs[-1])}",
-                    f"one {name} of {values[0]:.6g} for joints of very different size looks like a placeholder",
+                    f"one {name} of {values[0]:.6g} for joints of very different size is no measurement",
                 )
 
 
@@ -170,7 +170,7 @@ def _near_edge(model: mujoco.MjModel) -> Iterator[Finding]:
             yield Finding(
                 "notice",
                 f"body {name!r}",
-                "its inertia lies on the triangle inequality: a rounded digit can keep the file from compiling",
+                "its inertia lies on the triangle inequality: rounding a digit can stop compilation",
             )
 
 
@@ -192,6 +192,6 @@ def _joint_inertia(model: mujoco.MjModel) -> np.ndarray:
     return np.diag(M).copy()
 
 
-def _of(model: mujoco.MjModel, dof: int) -> str:
+def _of(model: mujoco.MjModel, dof: int | np.integer) -> str:
     joint = int(model.dof_jntid[dof])
     return f"joint {model.joint(joint).name!r}" if model.joint(joint).name else f"joint number {joint + 1}"

@@ -8,8 +8,11 @@ import dataclasses
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import escape
+
+import numpy as np
 
 from .errors import InputError
 
@@ -114,6 +117,11 @@ def edit(document: Document, edits: Iterable[Edit]) -> Document:
 def quote(value: str) -> str:
     """A value as it stands between the quotes of an attribute."""
     return escape(value, _QUOTES)
+
+
+def numbers(values: Any) -> str:
+    """Numbers as an attribute holds them, every digit of the float64."""
+    return " ".join(repr(float(value)) for value in np.ravel(values))
 
 
 def _decode(data: bytes, path: Path) -> str:

@@ -1,13 +1,11 @@
 """An arm as URDF, for the tools that read no MJCF."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Array, Float
 
 from .arm import Arm
 from .friction import Friction
-from .markup import quote
+from .markup import numbers, quote
 from .mjcf import com_from_standard
 
 UNLIMITED = 1e6
@@ -24,8 +22,8 @@ def to_urdf(
 ) -> str:
     """URDF of the arm: links, joints, limits and friction.
 
-    Every link's frame is the arm's, with its joint along z. URDF has no gravity, no armature, no springs and no
-    constant torque; a comment in the file says which of them were left out.
+    Every link's frame is the arm's, with its joint along z. URDF has no gravity, no armature, no springs
+    and no constant torque; a comment in the file says which of them were left out.
 
     Args:
         arm: geometry, limits, and the friction that its model holds already.
@@ -46,21 +44,22 @@ def to_urdf(
         lines += _link(arm.link_names[i], phi[i])
         kind = "prismatic" if arm.chain.prismatic[i] else "revolute"
         lower, upper = float(arm.lower[i]), float(arm.upper[i])
-        limits = f'effort="{_numbers(effort[i])}" velocity="{_numbers(velocity[i])}"'
+        limits = f'effort="{numbers(effort[i])}" velocity="{numbers(velocity[i])}"'
         if np.isfinite(lower) and np.isfinite(upper):
-            limits = f'lower="{_numbers(lower)}" upper="{_numbers(upper)}" {limits}'
+            limits = f'lower="{numbers(lower)}" upper="{numbers(upper)}" {limits}'
         elif kind == "revolute":
             kind = "continuous"
         else:
             limits = f'lower="{-UNLIMITED}" upper="{UNLIMITED}" {limits}'
+        rpy = _rpy(np.asarray(arm.chain.R[i], float))
         lines += [
             f'  <joint name="{quote(arm.joint_names[i])}" type="{kind}">',
             f'    <parent link="{quote(parents[i])}"/>',
             f'    <child link="{quote(arm.link_names[i])}"/>',
-            f'    <origin xyz="{_numbers(arm.chain.p[i])}" rpy="{_numbers(_rpy(np.asarray(arm.chain.R[i], float)))}"/>',
+            f'    <origin xyz="{numbers(arm.chain.p[i])}" rpy="{numbers(rpy)}"/>',
             '    <axis xyz="0 0 1"/>',
             f"    <limit {limits}/>",
-            f'    <dynamics damping="{_numbers(damping[i])}" friction="{_numbers(coulomb[i])}"/>',
+            f'    <dynamics damping="{numbers(damping[i])}" friction="{numbers(coulomb[i])}"/>',
             "  </joint>",
         ]
     return "\n".join([*lines, "</robot>", ""])
@@ -72,12 +71,12 @@ def _link(name: str, phi: np.ndarray) -> list[str]:
         return [f'  <link name="{quote(name)}"/>']
     mass, com, I = com_from_standard(phi)
     entries = zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), I[np.triu_indices(3)], strict=True)
-    inertia = " ".join(f'{key}="{_numbers(value)}"' for key, value in entries)
+    inertia = " ".join(f'{key}="{numbers(value)}"' for key, value in entries)
     return [
         f'  <link name="{quote(name)}">',
         "    <inertial>",
-        f'      <origin xyz="{_numbers(com)}" rpy="0 0 0"/>',
-        f'      <mass value="{_numbers(mass)}"/>',
+        f'      <origin xyz="{numbers(com)}" rpy="0 0 0"/>',
+        f'      <mass value="{numbers(mass)}"/>',
         f"      <inertia {inertia}/>",
         "    </inertial>",
         "  </link>",
@@ -88,13 +87,13 @@ def _left_out(arm: Arm, friction: Friction | None) -> list[str]:
     """A comment naming what the URDF does not hold."""
     parts = []
     if np.any(np.asarray(arm.armature)):
-        parts.append("armature " + _numbers(arm.armature))
+        parts.append("armature " + numbers(arm.armature))
     if np.any(np.asarray(arm.stiffness)):
-        parts.append("joint springs " + _numbers(arm.stiffness) + " about " + _numbers(arm.springref))
+        parts.append("joint springs " + numbers(arm.stiffness) + " about " + numbers(arm.springref))
     if friction is not None and friction.model == "sigmoid":
         parts.append("sigmoid friction")
     elif friction is not None and np.any(friction.offset):
-        parts.append("torque offsets " + _numbers(friction.offset))
+        parts.append("torque offsets " + numbers(friction.offset))
     return [f"  <!-- not in this file: {'; '.join(parts)} -->"] if parts else []
 
 
@@ -109,7 +108,3 @@ def _rpy(R: np.ndarray) -> np.ndarray:
     pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
     roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
     return np.array([roll, pitch, yaw])
-
-
-def _numbers(values: Any) -> str:
-    return " ".join(repr(float(value)) for value in np.ravel(values))
