@@ -9,5 +9,6 @@ from .constraints import mass_in_ellipsoid as mass_in_ellipsoid
 from .constraints import total_mass as total_mass
 from .constraints import triangle_inequality as triangle_inequality
 from .constraints import when as when
+from .exact import exact_penalty as exact_penalty
 from .solver import Solutions as Solutions
 from .solver import solve as solve

@@ -14,7 +14,6 @@ from jaxtyping import Float
 from ..arm import Arm
 from ..errors import InputError
 
-
 INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
 """Order of the six entries of an inertia tensor in tables and files."""
 
@@ -41,19 +40,25 @@ class Bounds:
         for name, box in self.boxes():
             lower, upper = box
             if np.isnan(lower) or np.isnan(upper) or lower > upper:
-                raise InputError(f"bounds of {name}: [{lower:g}, {upper:g}] is empty; lower must not exceed upper")
+                raise InputError(
+                    f"bounds of {name}: [{lower:g}, {upper:g}] is empty; lower must not exceed upper"
+                )
             if not name.startswith("I") and not (np.isfinite(lower) and np.isfinite(upper)):
                 raise InputError(f"bounds of {name}: [{lower:g}, {upper:g}] must be finite")
             if name.startswith("m") and upper <= 0:
-                raise InputError(f"bounds of {name}: the upper bound {upper:g} kg leaves no mass; give a positive one")
+                raise InputError(
+                    f"bounds of {name}: the upper bound {upper:g} kg leaves no mass; give a positive one"
+                )
             if name.startswith("m") and lower < 0:
-                raise InputError(f"bounds of {name}: the lower bound {lower:g} kg is negative; a mass is at least 0")
+                raise InputError(
+                    f"bounds of {name}: the lower bound {lower:g} kg is negative; a mass is at least 0"
+                )
         if self.total_mass is not None:
             least, most = self.mass.sum(0)
             if self.total_mass[0] > most or self.total_mass[1] < least:
                 raise InputError(
-                    f"bounds of total_mass: [{self.total_mass[0]:g}, {self.total_mass[1]:g}] kg cannot be met, "
-                    f"the links' masses add up to [{least:g}, {most:g}] kg"
+                    f"bounds of total_mass: [{self.total_mass[0]:g}, {self.total_mass[1]:g}] kg cannot be "
+                    f"met, the links' masses add up to [{least:g}, {most:g}] kg"
                 )
 
     @property
@@ -63,8 +68,12 @@ class Bounds:
     def boxes(self) -> list[tuple[str, Float[np.ndarray, " 2"]]]:
         """Every bound under its name in tables: `m1`, `c1x`, `I1xx`, ..., `total_mass`."""
         named = [(f"m{i + 1}", self.mass[i]) for i in range(self.dof)]
-        named += [(f"c{i + 1}{axis}", self.com[i, k]) for i in range(self.dof) for k, axis in enumerate("xyz")]
-        named += [(f"I{i + 1}{s}", self.inertia[i, k]) for i in range(self.dof) for k, s in enumerate(INERTIA)]
+        named += [
+            (f"c{i + 1}{axis}", self.com[i, k]) for i in range(self.dof) for k, axis in enumerate("xyz")
+        ]
+        named += [
+            (f"I{i + 1}{s}", self.inertia[i, k]) for i in range(self.dof) for k, s in enumerate(INERTIA)
+        ]
         return named + ([("total_mass", self.total_mass)] if self.total_mass is not None else [])
 
     @classmethod
@@ -78,8 +87,8 @@ class Bounds:
     def from_csv(cls, path: str | Path) -> "Bounds":
         """Read a table with the columns `name,lower,upper`.
 
-        Names: `m1` [kg], `c1x` [m], `I1xx` (about the centre of mass [kg m²]), 1-based, and `total_mass` [kg].
-        Mass and centre of mass are required for every link; inertia and total mass are unbounded where absent.
+        Names: `m1` [kg], `c1x` [m], `I1xx` (about the centre of mass [kg m²]), 1-based, and `total_mass`
+        [kg]. Mass and centre of mass are required for every link; what is absent of the rest is unbounded.
 
         Raises:
             InputError: naming the file, row and column of the first thing that is wrong.
@@ -89,13 +98,17 @@ class Bounds:
         wanted = [f"m{i + 1}" for i in range(dof)] + [f"c{i + 1}{a}" for i in range(dof) for a in "xyz"]
         missing = [name for name in wanted if name not in table]
         if missing or dof == 0:
-            raise InputError(f"{path}: no row for {', '.join(missing) or 'm1'}; every link needs m, cx, cy, cz")
+            raise InputError(
+                f"{path}: no row for {', '.join(missing) or 'm1'}; every link needs m, cx, cy, cz"
+            )
         diagonal, product = (0.0, np.inf), (-np.inf, np.inf)
         unbounded = dict(zip(INERTIA, [diagonal] * 3 + [product] * 3, strict=True))
         return cls(
             mass=np.array([table[f"m{i + 1}"] for i in range(dof)]),
             com=np.array([[table[f"c{i + 1}{a}"] for a in "xyz"] for i in range(dof)]),
-            inertia=np.array([[table.get(f"I{i + 1}{s}", unbounded[s]) for s in INERTIA] for i in range(dof)]),
+            inertia=np.array(
+                [[table.get(f"I{i + 1}{s}", unbounded[s]) for s in INERTIA] for i in range(dof)]
+            ),
             total_mass=np.array(table["total_mass"]) if "total_mass" in table else None,
         )
 
@@ -103,10 +116,10 @@ class Bounds:
     def around(cls, arm: Arm) -> "Bounds":
         """Bounds for an arm without published ones, from its nominal parameters and its geometry.
 
-        Mass: a fifth to three times the nominal one (at least up to 0.1 kg). Centre of mass: the box around the
-        link's own joint, the next joint and the nominal centre of mass, widened by 0.05 m and a quarter of its
-        size. Inertia: what the largest mass at the box's corners would have. Total mass: nominal within 25 %.
-        Wide on purpose: they keep the starts near the arm, they are not knowledge about it.
+        Mass: a fifth to three times the nominal one (at least up to 0.1 kg). Centre of mass: the box around
+        the link's own joint, the next joint and the nominal centre of mass, widened by 0.05 m and a quarter
+        of its size. Inertia: what the largest mass at the box's corners would have. Total mass: nominal
+        within 25 %. Wide on purpose: they keep the starts near the arm, they are not knowledge about it.
         """
         mass, com, _ = (np.asarray(x) for x in jax.vmap(inertia.to_com)(arm.standard))
         # The next joint in this link's frame; the last link has none, its own origin stands in.
@@ -130,7 +143,9 @@ def _read_table(path: Path) -> dict[str, tuple[float, float]]:
     try:
         text = path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a table of bounds ({error}); a CSV file would work") from error
+        raise InputError(
+            f"{path}: cannot be read as a table of bounds ({error}); a CSV file would work"
+        ) from error
     reader = csv.DictReader(text.splitlines())
     columns = {"name", "lower", "upper"}
     if not columns <= set(reader.fieldnames or ()):
@@ -139,7 +154,9 @@ def _read_table(path: Path) -> dict[str, tuple[float, float]]:
     for number, row in enumerate(reader, start=2):
         name = (row["name"] or "").strip()
         if not re.fullmatch(r"m\d+|c\d+[xyz]|I\d+(xx|yy|zz|xy|xz|yz)|total_mass", name):
-            raise InputError(f"{path}: row {number}, column name: '{name}' is none of m1, c1x, I1xx, total_mass")
+            raise InputError(
+                f"{path}: row {number}, column name: '{name}' is none of m1, c1x, I1xx, total_mass"
+            )
         if name in table:
             raise InputError(f"{path}: row {number}, column name: '{name}' occurs twice")
         table[name] = (_number(path, number, row, "lower"), _number(path, number, row, "upper"))

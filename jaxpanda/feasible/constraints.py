@@ -43,7 +43,7 @@ Constraint = Callable[[Links], Array]
 
 
 def triangle_inequality(links: Links) -> Float[Array, " dof"]:
-    r"""$\tfrac12\mathrm{tr}(I_c) - \lambda_{\max}(I_c) \ge 0$ [kg m²] of every link (Gaz et al. 2019, eq. 27).
+    r"""$\tfrac12\mathrm{tr}(I_c) - \lambda_{\max}(I_c) \ge 0$ [kg m²] of each link (Gaz et al. 2019, eq. 27).
 
     The solver's links satisfy it by construction; this is for checking, and for the exact penalty.
     """
@@ -66,18 +66,18 @@ def com_in_hull(link: int, points: Sequence[Sequence[float]] | Float[np.ndarray,
     try:
         faces = ConvexHull(np.asarray(points, float)).equations
     except (QhullError, ValueError) as error:
-        raise InputError(f"hull of link {link}: {len(points)} points span no volume; give four or more") from error
+        raise InputError(
+            f"hull of link {link}: {len(points)} points span no volume; give four or more"
+        ) from error
     normals, offsets = jnp.asarray(faces[:, :3]), jnp.asarray(faces[:, 3])
     return lambda links: -(normals @ links.com[link] + offsets)
 
 
-def com_in_cylinder(
-    link: int, start: Sequence[float], end: Sequence[float], radius: float
-) -> Constraint:
+def com_in_cylinder(link: int, start: Sequence[float], end: Sequence[float], radius: float) -> Constraint:
     """The centre of mass of `link` (0-based) lies in the cylinder from `start` to `end` (link's frame [m]).
 
-    Margins: distance [m] to either cap, and to the wall as $(r^2 - d^2)/2r$, smooth on the axis and the distance
-    itself to first order at the wall.
+    Margins: distance [m] to either cap, and to the wall as $(r^2 - d^2)/2r$, smooth on the axis and
+    the distance itself to first order at the wall.
     """
     p, axis = jnp.asarray(start, float), jnp.asarray(end, float) - jnp.asarray(start, float)
     length = jnp.linalg.norm(axis)
@@ -95,8 +95,8 @@ def com_in_cylinder(
 def mass_in_ellipsoid(link: int, centre: Sequence[float], semi_axes: Sequence[float]) -> Constraint:
     r"""All mass of `link` (0-based) could lie inside this ellipsoid along the link's axes [m].
 
-    $m - \int (x-x_s)^\top D^{-2} (x-x_s)\,dm \ge 0$ [kg], $D$ the semi-axes: necessary for a body inside it, and it
-    keeps a light link from having a heavy one's inertia.
+    $m - \int (x-x_s)^\top D^{-2} (x-x_s)\,dm \ge 0$ [kg], $D$ the semi-axes: necessary for a body inside it,
+    and it keeps a light link from having a heavy one's inertia.
 
     References:
         Wensing, Kim, Slotine, RA-L 2018, section III.

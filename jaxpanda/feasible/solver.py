@@ -4,16 +4,17 @@ $$\min_{x}\ \lVert A\,(\phi(x), \theta) - b\rVert^2 \quad\text{over links that c
 
 **Coordinates.** A link is $x = (m, c, L)$ with $\Sigma_c = LL^\top + \epsilon 1$ its second moment about the
 centre of mass and $L$ lower triangular. Every $x$ is a real body: $\Sigma_c \succeq 0$ *is* the triangle
-inequality. The boundary, where the optimum of real data lies, is at finite coordinates (log-Cholesky has it at
-infinity and crawls). Boxes on $m$, $c$ and $\theta$ are kept exactly, by projection.
+inequality. The boundary, where the optimum of real data lies, is at finite coordinates (log-Cholesky has it
+at infinity and crawls). Boxes on $m$, $c$ and $\theta$ are kept exactly, by projection.
 
 **Steps.** Newton with Levenberg's damping. With $D = \partial\phi/\partial x$ and $\Gamma$ the gradient with
 respect to $\Sigma_c$, the Hessian is $2D^\top A^\top A D$ plus one block a link,
 $\mathrm{diag}(0,\, 2m\Gamma,\, 2\,\Gamma \otimes 1)$, plus a coupling of $m$ and $c$ proportional to
-$\partial f/\partial c$. At an optimum $\Gamma \succeq 0$ (it is the multiplier of the triangle inequality) and the
-coupling vanishes for every free $c$. So $\Gamma$ is replaced by its positive part and the coupling left out: each
-step's matrix is positive definite, and it is the exact Hessian where it matters. Gauss-Newton alone would
-converge linearly, because the residual does not vanish.
+$\partial f/\partial c$. At an optimum $\Gamma \succeq 0$ (it is the multiplier of the triangle inequality) and
+the coupling vanishes for every free $c$. So $\Gamma$ is replaced by its positive part and the coupling left
+out: each step's matrix is positive definite, and it is the exact Hessian where it matters. Gauss-Newton alone
+would converge linearly, because the residual does not vanish. Valleys curve; each step is bent along
+(`_bend`).
 
 **Constraints** (inertia boxes, total mass, the user's) enter as squared hinges with multipliers (augmented
 Lagrangian), aimed a little inside so that what is left is exactly no violation.
@@ -22,10 +23,8 @@ Every start does the same work, so that a batch of them is a batch of small dens
 """
 
 import dataclasses
-import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -38,18 +37,18 @@ from ..errors import InputError, require_x64
 from .bounds import Bounds
 from .constraints import Constraint, Links, triangle_inequality
 
-
 STARTS = 2048
 """Default number of random starts."""
 CHUNK = 64
 ROUNDS = 4
-ITERATIONS = 20
+ITERATIONS = 25
 """Newton steps a round; after each round the multipliers of the constraints are updated."""
 
 _TRIANGLE_INSET = 1e-8  # [kg m²]
 _COM_INSET = 1e-9  # [m]: m c / m need not give c to the last bit
 _MARGIN_INSET = 1e-6  # in the constraint's own unit
 _DAMPING = 1e-2
+_MOST_BEND = 0.375
 _WEIGHT = 1.0
 _LEAST_MASS = 1e-3  # [kg]: a link without mass is no body, and MuJoCo refuses it
 
@@ -57,9 +56,9 @@ _ROW = np.array([0, 1, 1, 2, 2, 2])
 _COLUMN = np.array([0, 0, 1, 0, 1, 2])
 _SAME_COLUMN = (_COLUMN[:, None] == _COLUMN).astype(float)
 # The order xx, yy, zz, xy, xz, yz of tables.
-_XYZ_ROW = np.array([0, 1, 2, 0, 0, 1])
-_XYZ_COLUMN = np.array([0, 1, 2, 1, 2, 2])
-_XYZ_MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+XYZ_ROW = np.array([0, 1, 2, 0, 0, 1])
+XYZ_COLUMN = np.array([0, 1, 2, 1, 2, 2])
+XYZ_MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +72,7 @@ class Solutions:
     objective: Float[np.ndarray, " starts"]
     r"""$\lVert A x - b\rVert^2$ at the end."""
     violation: Float[np.ndarray, " starts"]
-    """The largest amount by which any bound or constraint is missed, recomputed from `phi`; 0 where none is."""
+    """Largest amount by which a bound or constraint is missed, recomputed from `phi`; 0 where none is."""
     converged: Bool[np.ndarray, " starts"]
     """Feasible, and the last round's second half gained less than 0.1 %."""
     iterations: Int[np.ndarray, " starts"]
@@ -126,7 +125,7 @@ def solve(
         InputError: shapes do not fit each other, or a number is not finite.
     """
     require_x64("feasible.solve")
-    problem = _problem(A, b, bounds, tuple(constraints), extra_lower, extra_upper)
+    problem = scaled_problem(A, b, bounds, tuple(constraints), extra_lower, extra_upper)
     if starts < 1:
         raise InputError(f"starts: {starts} is too few; at least 1")
     chunk = min(chunk, starts)
@@ -135,21 +134,13 @@ def solve(
     began = time.perf_counter()
     run = _run_chunk.lower(problem, padded[:chunk], rounds, iterations).compile()
     compiled = time.perf_counter()
-    done = 0
-
-    def one(start: int):
-        nonlocal done
-        out = jax.block_until_ready(run(problem, padded[start : start + chunk], rounds, iterations))
-        done = min(done + chunk, starts)
+    chunks = []
+    for first in range(0, starts, chunk):
+        chunks.append(jax.device_get(run(problem, padded[first : first + chunk], rounds, iterations)))
         if progress is not None:
-            progress(done, starts)
-        return out
-
-    # On a CPU one compiled program runs on one core: as many chunks side by side as there are cores.
-    workers = 1
-    with ThreadPoolExecutor(workers) as pool:
-        chunks = list(pool.map(one, range(0, starts, chunk)))
-    phi, extra, violation, converged, count = (np.concatenate(parts)[:starts] for parts in zip(*chunks, strict=True))
+            progress(min(first + chunk, starts), starts)
+    parts = (np.concatenate(part)[:starts] for part in zip(*chunks, strict=True))
+    phi, extra, violation, converged, accepted = parts
     residual = np.concatenate([phi.reshape(starts, -1), extra], -1) @ A.T - b
     return Solutions(
         phi=phi,
@@ -157,13 +148,13 @@ def solve(
         objective=np.sum(residual**2, -1),
         violation=violation,
         converged=converged,
-        iterations=count,
+        iterations=accepted,
         compile_seconds=compiled - began,
         run_seconds=time.perf_counter() - compiled,
     )
 
 
-class _Problem(eqx.Module):
+class Problem(eqx.Module):
     """One problem in scaled form; unknowns x = (m, c, L of each link; extra), flat."""
 
     A: Float[Array, "rows columns"]
@@ -183,19 +174,21 @@ class _Problem(eqx.Module):
     dof: int = eqx.field(static=True)
 
 
-def _problem(
+def scaled_problem(
     A: Float[np.ndarray, "rows columns"],
     b: Float[np.ndarray, " rows"],
     bounds: Bounds,
     constraints: tuple[Constraint, ...],
     extra_lower: Float[np.ndarray, " extra"] | None,
     extra_upper: Float[np.ndarray, " extra"] | None,
-) -> _Problem:
+) -> Problem:
     """Check the input and scale it."""
     dof = bounds.dof
     extra = A.shape[1] - 10 * dof
     if extra < 0:
-        raise InputError(f"A has {A.shape[1]} columns, fewer than the ten of each of {dof} links in the bounds")
+        raise InputError(
+            f"A has {A.shape[1]} columns, fewer than the ten of each of {dof} links in the bounds"
+        )
     if len(A) != len(b):
         raise InputError(f"A has {len(A)} rows and b has {len(b)}; they must be as many")
     if not (np.all(np.isfinite(A)) and np.all(np.isfinite(b))):
@@ -222,7 +215,7 @@ def _problem(
     of_extra = np.where(of_extra > 0, of_extra, 1.0)
     sigma = np.sqrt(np.mean((norms * np.concatenate([order, of_extra])) ** 2)) or 1.0
     A_scaled, b_scaled = jnp.asarray(A / sigma), jnp.asarray(b / sigma)
-    return _Problem(
+    return Problem(
         A=A_scaled,
         b=b_scaled,
         Q=2 * A_scaled.T @ A_scaled,
@@ -257,7 +250,7 @@ def _root_inertia(bounds: Bounds) -> Float[np.ndarray, " dof"]:
 
 
 def _initial(
-    problem: _Problem,
+    problem: Problem,
     bounds: Bounds,
     initial: Float[np.ndarray, "given dof 10"] | None,
     starts: int,
@@ -275,13 +268,20 @@ def _initial(
     return x0.at[: len(given)].set(jnp.clip(given, problem.lower, problem.upper))
 
 
-def _random_start(problem: _Problem, middling: Float[Array, " dof"], key: Key[Array, ""]) -> Float[Array, " columns"]:
+def _random_start(
+    problem: Problem, middling: Float[Array, " dof"], key: Key[Array, ""]
+) -> Float[Array, " columns"]:
     """Mass and centre of mass uniform in their boxes; L normal, of the size that suits the mass."""
     of_box, of_L = jax.random.split(key)
     links = 10 * problem.dof
     lower, upper, scale = (x[:links].reshape(-1, 10) for x in (problem.lower, problem.upper, problem.scale))
     boxes = jax.random.uniform(of_box, (problem.dof, 4), minval=lower[:, :4], maxval=upper[:, :4])
-    L = 0.5 * jax.random.normal(of_L, (problem.dof, 6)) * scale[:, 4:] * jnp.sqrt(boxes[:, :1] / middling[:, None])
+    L = (
+        0.5
+        * jax.random.normal(of_L, (problem.dof, 6))
+        * scale[:, 4:]
+        * jnp.sqrt(boxes[:, :1] / middling[:, None])
+    )
     extra = jnp.clip(jnp.zeros_like(problem.scale[links:]), problem.lower[links:], problem.upper[links:])
     return jnp.concatenate([jnp.concatenate([boxes, L], -1).ravel(), extra])
 
@@ -297,7 +297,7 @@ def _second_moment(x: Float[Array, "10"]) -> Float[Array, "3 3"]:
 def _phi_and_inertia(x: Float[Array, "10"]) -> Float[Array, "16"]:
     """`phi`, then xx, yy, zz, xy, xz, yz of the inertia about the centre of mass."""
     I_com = inertia.inertia(_second_moment(x))
-    return jnp.concatenate([inertia.from_com(x[0], x[1:4], I_com), I_com[_XYZ_ROW, _XYZ_COLUMN]])
+    return jnp.concatenate([inertia.from_com(x[0], x[1:4], I_com), I_com[XYZ_ROW, XYZ_COLUMN]])
 
 
 def _coordinates(phi: Float[Array, "10"]) -> Float[Array, "10"]:
@@ -320,7 +320,7 @@ def _gradient_in_Sigma(of_I: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
 
 
 def _positive_part(S: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The nearest positive semidefinite matrix, by Jacobi rotations: many times faster in a batch than LAPACK."""
+    """The nearest positive semidefinite matrix, by Jacobi rotations: faster in a batch than LAPACK."""
     V = jnp.eye(3, dtype=S.dtype)
     for _ in range(4):
         for p, q in ((0, 1), (0, 2), (1, 2)):
@@ -348,16 +348,16 @@ class _Margins(eqx.Module):
     user: Float[Array, " user"]
 
 
-def _links(problem: _Problem, x: Float[Array, " columns"], of_I: Float[Array, "dof 6"]) -> Links:
+def _links(problem: Problem, x: Float[Array, " columns"], of_I: Float[Array, "dof 6"]) -> Links:
     link = x[: 10 * problem.dof].reshape(-1, 10)
-    return Links(link[:, 0], link[:, 1:4], jax.vmap(lambda six: six[_XYZ_MATRIX])(of_I))
+    return Links(link[:, 0], link[:, 1:4], jax.vmap(lambda six: six[XYZ_MATRIX])(of_I))
 
 
-def _user_margins(problem: _Problem, links: Links) -> Float[Array, " user"]:
+def _user_margins(problem: Problem, links: Links) -> Float[Array, " user"]:
     return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(c(links)) for c in problem.constraints)])
 
 
-def _margins(problem: _Problem, links: Links, of_I: Float[Array, "dof 6"]) -> _Margins:
+def _margins(problem: Problem, links: Links, of_I: Float[Array, "dof 6"]) -> _Margins:
     total = jnp.sum(links.mass)
     return _Margins(
         inertia=jnp.stack([of_I - problem.inertia[..., 0], problem.inertia[..., 1] - of_I], -1),
@@ -368,15 +368,13 @@ def _margins(problem: _Problem, links: Links, of_I: Float[Array, "dof 6"]) -> _M
 
 def _hinges(margins: _Margins, multipliers: _Margins, weight: Float[Array, ""]) -> _Margins:
     """Pressure of each constraint: not negative, zero where it is amply satisfied."""
-    return jax.tree.map(
-        lambda g, y: jnp.maximum(0.0, y + weight * (_MARGIN_INSET - g)), margins, multipliers
-    )
+    return jax.tree.map(lambda g, y: jnp.maximum(0.0, y + weight * (_MARGIN_INSET - g)), margins, multipliers)
 
 
-def _violation(problem: _Problem, phi: Float[Array, "dof 10"]) -> Float[Array, ""]:
+def largest_violation(problem: Problem, phi: Float[Array, "dof 10"]) -> Float[Array, ""]:
     """The largest amount by which anything is missed; from `phi` alone, as any other program would see it."""
     links = Links.from_phi(phi)
-    of_I = links.I_com[:, _XYZ_ROW, _XYZ_COLUMN]
+    of_I = links.I_com[:, XYZ_ROW, XYZ_COLUMN]
     margins = _margins(problem, links, of_I)
     boxes = [
         (value - box[..., 0], box[..., 1] - value)
@@ -399,7 +397,7 @@ class _State(eqx.Module):
 
 
 def _evaluate(
-    problem: _Problem, x: Float[Array, " columns"], multipliers: _Margins, weight: Float[Array, ""]
+    problem: Problem, x: Float[Array, " columns"], multipliers: _Margins, weight: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, " rows"]]:
     """Scaled objective with the constraints' penalty, and the residual."""
     links = 10 * problem.dof
@@ -414,7 +412,7 @@ def _sum_squares(tree: _Margins) -> Float[Array, ""]:
 
 
 def _quadratic_model(
-    problem: _Problem, state: _State, multipliers: _Margins, weight: Float[Array, ""]
+    problem: Problem, state: _State, multipliers: _Margins, weight: Float[Array, ""]
 ) -> tuple[Float[Array, " columns"], Float[Array, "columns columns"]]:
     """Gradient and positive semidefinite Hessian in x."""
     n, dof = 10 * problem.dof, problem.dof
@@ -440,7 +438,7 @@ def _quadratic_model(
     if problem.constraints:
         jac = jax.jacrev(lambda links: _user_margins(problem, links))(links)
         of_I_user = 0.5 * (jac.I_com + jnp.swapaxes(jac.I_com, -1, -2))
-        six = of_I_user[..., _XYZ_ROW, _XYZ_COLUMN] * jnp.array([1, 1, 1, 2, 2, 2])
+        six = of_I_user[..., XYZ_ROW, XYZ_COLUMN] * jnp.array([1, 1, 1, 2, 2, 2])
         J = jnp.concatenate([jac.mass[..., None], jac.com, jnp.zeros((*jac.mass.shape, 6))], -1)
         J = J + jnp.einsum("klj,lja->kla", six, E)
         gradient = gradient - jnp.einsum("k,kla->la", hinges.user, J)
@@ -453,22 +451,46 @@ def _quadratic_model(
     return jnp.concatenate([gradient.ravel(), of_A[n:]]), H
 
 
+def _bend(
+    problem: Problem, x: Float[Array, " columns"], velocity: Float[Array, " columns"]
+) -> Float[Array, " columns"]:
+    r"""Gradient $D^\top 2A^\top A\,\phi''(v, v)$ that a straight step in x meets because phi is curved in x.
+
+    References:
+        Transtrum and Sethna, "Geodesic acceleration and the small-curvature approximation", 2012.
+    """
+    columns = lambda x: _columns(problem, x)
+    along = lambda x: jax.jvp(columns, (x,), (velocity,))[1]
+    second = jax.jvp(along, (x,), (velocity,))[1]
+    return jax.vjp(columns, x)[1](problem.Q @ second)[0]
+
+
+def _columns(problem: Problem, x: Float[Array, " columns"]) -> Float[Array, " columns"]:
+    """What A multiplies: phi of every link, then the extra unknowns."""
+    n = 10 * problem.dof
+    return jnp.concatenate([jax.vmap(_phi_and_inertia)(x[:n].reshape(-1, 10))[:, :10].ravel(), x[n:]])
+
+
 def _of_inertia(of_six: Float[Array, "6"]) -> Float[Array, "3 3"]:
     """The matrix G with <G, I> = of_six . (Ixx, Ixy, Iyy, Ixz, Iyz, Izz), the kernels' order."""
     return 0.5 * (inertia.symmetric(of_six) + jnp.diag(jnp.diagonal(inertia.symmetric(of_six))))
 
 
-def _step(problem: _Problem, state: _State, multipliers: _Margins, weight: Float[Array, ""]) -> _State:
+def _step(problem: Problem, state: _State, multipliers: _Margins, weight: Float[Array, ""]) -> _State:
     """One damped Newton step, kept if it lowers the objective."""
     gradient, H = _quadratic_model(problem, state, multipliers, weight)
-    gradient, H = gradient * problem.scale, H * problem.scale[:, None] * problem.scale
+    H = H * problem.scale[:, None] * problem.scale
     held = ((state.x <= problem.lower) & (gradient > 0)) | ((state.x >= problem.upper) & (gradient < 0))
     damped = jnp.where(held[:, None] | held, 0, H) + jnp.diag(jnp.where(held, 1.0, state.damping))
     factor = jnp.linalg.cholesky(damped)
-    step = -jax.scipy.linalg.cho_solve((factor, True), jnp.where(held, 0, gradient))
+    solve = lambda g: -jax.scipy.linalg.cho_solve((factor, True), jnp.where(held, 0, g * problem.scale))
+    step = solve(gradient)
+    bend = 0.5 * solve(_bend(problem, state.x, step * problem.scale))
+    most = _MOST_BEND * jnp.linalg.norm(step)
+    step = step + bend * jnp.minimum(1.0, most / jnp.maximum(jnp.linalg.norm(bend), 1e-300))
     x = jnp.clip(state.x + step * problem.scale, problem.lower, problem.upper)
     taken = (x - state.x) / problem.scale
-    expected = -(gradient @ taken + 0.5 * taken @ (H @ taken))
+    expected = -((gradient * problem.scale) @ taken + 0.5 * taken @ (H @ taken))
     value, residual = _evaluate(problem, x, multipliers, weight)
     better = value < state.value  # false for what is not a number
     gain = (state.value - value) / jnp.where(expected > 0, expected, 1.0)
@@ -484,7 +506,7 @@ def _step(problem: _Problem, state: _State, multipliers: _Margins, weight: Float
     )
 
 
-def _run_one(problem: _Problem, x0: Float[Array, " columns"], rounds: int, iterations: int):
+def _run_one(problem: Problem, x0: Float[Array, " columns"], rounds: int, iterations: int):
     """One start: Newton steps in rounds, with the multipliers updated after each."""
     n = 10 * problem.dof
     of_I = jax.vmap(_phi_and_inertia)(x0[:n].reshape(-1, 10))[:, 10:]
@@ -508,12 +530,12 @@ def _run_one(problem: _Problem, x0: Float[Array, " columns"], rounds: int, itera
     weights = _WEIGHT * 10.0 ** jnp.arange(rounds)
     (state, _), values = jax.lax.scan(one_round, (state, multipliers), weights)
     phi = jax.vmap(_phi_and_inertia)(state.x[:n].reshape(-1, 10))[:, :10]
-    violation = _violation(problem, phi)
+    violation = largest_violation(problem, phi)
     late = values[-1, iterations // 2] - values[-1, -1]
     settled = late <= 1e-3 * values[-1, -1] + 1e-12 * problem.b @ problem.b
     return phi, state.x[n:], violation, settled & (violation == 0), state.accepted
 
 
 @eqx.filter_jit
-def _run_chunk(problem: _Problem, x0: Float[Array, "chunk columns"], rounds: int, iterations: int):
+def _run_chunk(problem: Problem, x0: Float[Array, "chunk columns"], rounds: int, iterations: int):
     return jax.vmap(lambda x: _run_one(problem, x, rounds, iterations))(x0)

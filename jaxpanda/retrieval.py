@@ -1,0 +1,373 @@
+"""`retrieve`: links that could be built behind identified coefficients, from many starts at once."""
+
+import dataclasses
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from jaxpanda_kernels import inertia
+from jaxtyping import Float
+
+from .arm import Arm
+from .certificate import lower_bound
+from .errors import InputError
+from .feasible import Bounds, Constraint, Links, Solutions, exact_penalty, solve
+from .feasible.bounds import INERTIA
+from .feasible.solver import STARTS
+from .files import finite, output_folder, read_json, to_json
+from .friction import Friction
+from .identification import Identification
+from .parameters import coefficient_matrix
+
+SCHEMA = "jaxpanda.retrieval/1"
+FILE = "retrieval.json"
+STARTS_FILE = "starts.npz"
+AS_GOOD = 1.01
+"""A solution is as good as the best where its objective is within this factor of it."""
+ACTIVE = 1e-5
+"""A constraint is active where its margin is below this share of its box (triangle inequality: [kg m²])."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Retrieval:
+    """Feasible parameters of every link, and what the coefficients do not tell about them."""
+
+    standard: Float[np.ndarray, "dof 10"]
+    """Order and units as in `jaxpanda_kernels.inertia`."""
+    objective: float
+    """Weighted sum of squared differences between the coefficients of these links and the identified ones."""
+    max_violation: float
+    """Largest amount by which a bound or constraint is missed; 0.0 where all hold."""
+    margins: Mapping[str, Any]
+    """Of every constraint [SI]: `triangle`, `mass`, `com`, `inertia`, `total_mass`, `user`."""
+    active: tuple[str, ...]
+    """Constraints that hold the solution back."""
+    spread: Mapping[str, tuple[float, float]]
+    """Least and largest value of `m1`, `c1x`, `I1xx`, ... over the starts as good as the best: what the
+    coefficients cannot tell."""
+    as_good: int
+    """How many starts those are."""
+    starts: int
+    seed: int
+    lower_bound: float | None
+    """Certified: no feasible links have a lower objective. None where no certificate was computed."""
+    weighting: str
+    penalty: str
+    compile_seconds: float
+    run_seconds: float
+    link_names: tuple[str, ...]
+    arm: str = ""
+    friction: Friction | None = None
+    """As identified; carried along for the export."""
+    notes: tuple[str, ...] = ()
+    """What the user should know before relying on this."""
+    solutions: Solutions | None = None
+    """Every start's outcome."""
+
+    @property
+    def dof(self) -> int:
+        return len(self.standard)
+
+    @property
+    def links(self) -> list[dict[str, Any]]:
+        """Name, mass, centre of mass and inertia about it of every link, as files hold them."""
+        mass, com, six = _described(self.standard)
+        return [
+            {"name": name, "mass": float(mass[i]), "com": com[i].tolist(), "inertia": six[i].tolist()}
+            for i, name in enumerate(self.link_names)
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """As `retrieval.json` holds it."""
+        return {
+            "schema": SCHEMA,
+            "arm": self.arm,
+            "starts": self.starts,
+            "seed": self.seed,
+            "objective": self.objective,
+            "lower_bound": self.lower_bound,
+            "max_violation": self.max_violation,
+            "total_mass": float(self.standard[:, 0].sum()),
+            "links": self.links,
+            "standard": self.standard.tolist(),
+            "friction": [] if self.friction is None else self.friction.to_json(),
+            "margins": dict(self.margins),
+            "active": list(self.active),
+            "as_good": self.as_good,
+            "spread": {name: list(pair) for name, pair in self.spread.items()},
+            "weighting": self.weighting,
+            "penalty": self.penalty,
+            "seconds": {"compile": self.compile_seconds, "run": self.run_seconds},
+            "notes": list(self.notes),
+        }
+
+    def save(self, folder: str | Path) -> Path:
+        """Write `retrieval.json`, and every start's outcome as `starts.npz`; both or neither."""
+        with output_folder(folder) as scratch:
+            (scratch / FILE).write_text(to_json(self.to_json()), "utf-8")
+            if self.solutions is not None:
+                arrays = dataclasses.asdict(self.solutions)
+                np.savez_compressed(scratch / STARTS_FILE, **arrays)
+        return Path(folder) / FILE
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Retrieval":
+        """Read `retrieval.json` or the folder that holds it, with `starts.npz` where that is there.
+
+        Raises:
+            InputError: naming the file and the field that is wrong.
+        """
+        path = Path(path)
+        file = path / FILE if path.is_dir() else path
+        document = read_json(file)
+        if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
+            raise InputError(f"{file}: is no retrieval (schema '{SCHEMA}'); `retrieve` writes one")
+        try:
+            return cls(
+                standard=np.array(document["standard"], float).reshape(len(document["links"]), 10),
+                objective=float(document["objective"]),
+                max_violation=float(document["max_violation"]),
+                margins=document["margins"],
+                active=tuple(document["active"]),
+                spread={name: (low, high) for name, (low, high) in document["spread"].items()},
+                as_good=int(document["as_good"]),
+                starts=int(document["starts"]),
+                seed=int(document["seed"]),
+                lower_bound=document["lower_bound"],
+                weighting=document["weighting"],
+                penalty=document["penalty"],
+                compile_seconds=float(document["seconds"]["compile"]),
+                run_seconds=float(document["seconds"]["run"]),
+                link_names=tuple(link["name"] for link in document["links"]),
+                arm=document["arm"],
+                friction=Friction.from_json(document["friction"]) if document["friction"] else None,
+                notes=tuple(document["notes"]),
+                solutions=_load_starts(file.with_name(STARTS_FILE)),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{file}: field missing or malformed ({error}); `retrieve` writes it whole"
+            ) from None
+
+
+def retrieve(
+    identification: Identification | Mapping[str, Any] | str | Path,
+    *,
+    bounds: Bounds | str | Path | None = None,
+    arm: Arm | None = None,
+    constraints: Sequence[Constraint] = (),
+    weighting: Literal["none", "covariance"] = "none",
+    penalty: Literal["smooth", "exact"] = "smooth",
+    prefer: Literal["best", "nominal"] = "best",
+    starts: int = STARTS,
+    seed: int = 0,
+    certificate: bool | Literal["auto"] = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> Retrieval:
+    r"""Feasible parameters of the links behind identified coefficients (Gaz et al. 2019, section IV).
+
+    $\min_\phi \lVert K\phi - \hat\beta\rVert^2$ over links that could be built, $K$ and $\hat\beta$ the
+    coefficients that are reliable.
+
+    Args:
+        identification: a result, a table with the field `coefficients`, or the file that holds either.
+        bounds: boxes on the links' parameters, or their table. Without them: around `arm` where one is given,
+            the published ones for a Panda.
+        arm: whose nominal parameters to set bounds around, and to be near to under `prefer="nominal"`.
+        constraints: further ones, as functions of `Links` that return margins.
+        weighting: "none" as in the paper; "covariance" weighs each coefficient by how sure it is.
+        penalty: "smooth" is `feasible.solve`; "exact" is the paper's Algorithm 1, for comparison.
+        prefer: among starts as good as the best, the very best, or the nearest to `arm`.
+        starts: random starts.
+        seed: same seed, same answer.
+        certificate: lower bound by convex optimisation; "auto" where the extra [sdp] is installed.
+        progress: called with (starts done, starts).
+
+    Raises:
+        InputError: malformed table or bounds, or no start ends feasible.
+        MissingExtraError: `certificate=True` without the extra [sdp].
+    """
+    table = _identified(identification)
+    boxes = _bounds(bounds, arm, table)
+    A, b = _equations(table, boxes.dof, weighting)
+    run = {"smooth": solve, "exact": exact_penalty}[penalty]
+    found = run(A, b, boxes, constraints=tuple(constraints), starts=starts, seed=seed, progress=progress)
+    feasible = found.violation == 0
+    if not feasible.any() and penalty == "smooth":
+        raise InputError(
+            f"no start of {starts} satisfies all bounds and constraints (nearest misses by "
+            f"{found.violation.min():.2g}); widen them, or give more starts"
+        )
+    as_good = feasible & (found.objective <= AS_GOOD * found.objective[found.best])
+    as_good[found.best] = True
+    chosen = _nearest(found.phi, as_good, arm, boxes) if prefer == "nominal" else found.best
+    wanted = certificate is True or (
+        certificate == "auto" and importlib.util.find_spec("clarabel") is not None
+    )
+    margins = _margins(found.phi[chosen], boxes, constraints)
+    names = table.link_names if len(table.link_names) == boxes.dof else ()
+    return Retrieval(
+        standard=found.phi[chosen],
+        objective=float(found.objective[chosen]),
+        max_violation=float(found.violation[chosen]),
+        margins=margins,
+        active=tuple(_active(margins, boxes)),
+        spread=_spread(found.phi[as_good]),
+        as_good=int(as_good.sum()),
+        starts=starts,
+        seed=seed,
+        lower_bound=lower_bound(A, b, boxes).lower_bound if wanted else None,
+        weighting=weighting,
+        penalty=penalty,
+        compile_seconds=found.compile_seconds,
+        run_seconds=found.run_seconds,
+        link_names=names or tuple(f"link{i + 1}" for i in range(boxes.dof)),
+        arm=table.arm,
+        friction=table.friction,
+        notes=tuple(_notes(table, found)),
+        solutions=found,
+    )
+
+
+def _identified(identification: Identification | Mapping[str, Any] | str | Path) -> Identification:
+    if isinstance(identification, Identification):
+        return identification
+    if isinstance(identification, Mapping):
+        return Identification.from_json(identification)
+    return Identification.load(identification)
+
+
+def _bounds(bounds: Bounds | str | Path | None, arm: Arm | None, table: Identification) -> Bounds:
+    if bounds is None:
+        if arm is not None:
+            chosen = Bounds.around(arm)
+        elif table.arm in ("", "panda") and table.dof <= 7:
+            chosen = Bounds.panda()
+        else:
+            raise InputError(
+                f"bounds: none are known for the arm '{table.arm}'; give a table of bounds or the model"
+            )
+    else:
+        chosen = bounds if isinstance(bounds, Bounds) else Bounds.from_csv(bounds)
+    if chosen.dof < table.dof:
+        raise InputError(f"bounds: cover {chosen.dof} links, the coefficients name link {table.dof}")
+    return chosen
+
+
+def _equations(
+    table: Identification, dof: int, weighting: str
+) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " rows"]]:
+    """Rows of the reliable coefficients, weighed."""
+    kept = np.flatnonzero(table.reliable)
+    if len(kept) == 0:
+        raise InputError("coefficients: none is reliable, so there is nothing to retrieve from")
+    A = coefficient_matrix(table.terms, dof)[kept]
+    b = table.beta[kept]
+    if weighting == "none":
+        return A, b
+    if table.covariance is not None:
+        root = np.linalg.cholesky(table.covariance[np.ix_(kept, kept)])
+        return np.linalg.solve(root, A), np.linalg.solve(root, b)
+    if table.std is None or not np.all(table.std[kept] > 0):
+        raise InputError("coefficients: weighting by covariance needs a positive 'std' of every coefficient")
+    return A / table.std[kept, None], b / table.std[kept]
+
+
+def _described(
+    phi: Float[np.ndarray, "*shape 10"],
+) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape 6"]]:
+    """Mass, centre of mass, and xx yy zz xy xz yz of the inertia about it."""
+    flat = phi.reshape(-1, 10)
+    mass, com, I_com = (np.asarray(x) for x in jax.vmap(inertia.to_com)(flat))
+    six = I_com[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    shape = phi.shape[:-1]
+    return mass.reshape(shape), com.reshape(*shape, 3), six.reshape(*shape, 6)
+
+
+def _nearest(
+    phi: Float[np.ndarray, "starts dof 10"], among: np.ndarray, arm: Arm | None, bounds: Bounds
+) -> int:
+    """The start whose masses and centres of mass are nearest to the arm's, as shares of their boxes."""
+    if arm is None:
+        raise InputError("prefer='nominal' needs the arm whose parameters are nominal")
+    width = np.concatenate([np.diff(bounds.mass), np.diff(bounds.com)[..., 0]], -1)
+    of = lambda phi: np.concatenate([_described(phi)[0][..., None], _described(phi)[1]], -1)
+    distance = np.sum(((of(phi) - of(np.asarray(arm.standard))) / np.where(width > 0, width, 1)) ** 2, (1, 2))
+    return int(np.argmin(np.where(among, distance, np.inf)))
+
+
+def _spread(phi: Float[np.ndarray, "starts dof 10"]) -> dict[str, tuple[float, float]]:
+    mass, com, six = _described(phi)
+    columns = {}
+    for i in range(phi.shape[1]):
+        columns[f"m{i + 1}"] = mass[:, i]
+        columns |= {f"c{i + 1}{axis}": com[:, i, k] for k, axis in enumerate("xyz")}
+        columns |= {f"I{i + 1}{entry}": six[:, i, k] for k, entry in enumerate(INERTIA)}
+    columns["total_mass"] = mass.sum(-1)
+    return {name: (float(values.min()), float(values.max())) for name, values in columns.items()}
+
+
+def _margins(
+    phi: Float[np.ndarray, "dof 10"], bounds: Bounds, constraints: Sequence[Constraint]
+) -> dict[str, Any]:
+    """(value - lower, upper - value) of every box, the triangle inequality, and the user's margins."""
+    mass, com, six = _described(phi)
+    I_com = np.asarray(jax.vmap(inertia.to_com)(phi)[2])
+    Sigma = 0.5 * np.trace(I_com, axis1=1, axis2=2)[:, None, None] * np.eye(3) - I_com
+    pair = lambda value, box: [finite(value - box[0]), finite(box[1] - value)]
+    links = Links.from_phi(jax.numpy.asarray(phi))
+    total = bounds.total_mass
+    return {
+        "triangle": np.linalg.eigvalsh(Sigma)[:, 0].tolist(),
+        "mass": [pair(mass[i], bounds.mass[i]) for i in range(len(phi))],
+        "com": [[pair(com[i, k], bounds.com[i, k]) for k in range(3)] for i in range(len(phi))],
+        "inertia": [[pair(six[i, k], bounds.inertia[i, k]) for k in range(6)] for i in range(len(phi))],
+        "total_mass": None if total is None else pair(mass.sum(), total),
+        "user": [[finite(v) for v in np.ravel(constraint(links))] for constraint in constraints],
+    }
+
+
+def _active(margins: Mapping[str, Any], bounds: Bounds) -> list[str]:
+    """Names of the constraints without slack; boxes that are points are not constraints."""
+    found = [f"triangle inequality of link {i + 1}" for i, m in enumerate(margins["triangle"]) if m <= ACTIVE]
+    rows = [margins["mass"], *zip(*margins["com"], strict=True), *zip(*margins["inertia"], strict=True)]
+    named = [f"m{i + 1}" for i in range(bounds.dof)]
+    named += [f"c{i + 1}{axis}" for axis in "xyz" for i in range(bounds.dof)]
+    named += [f"I{i + 1}{entry}" for entry in INERTIA for i in range(bounds.dof)]
+    pairs = [*zip(named, (pair for row in rows for pair in row), strict=True)]
+    if margins["total_mass"] is not None:
+        pairs.append(("total_mass", margins["total_mass"]))
+    for name, pair in pairs:
+        width = np.inf if None in pair else sum(pair)
+        close = ACTIVE * (width if np.isfinite(width) else 1.0)
+        found += [
+            f"{name} {end}"
+            for end, m in zip(("lower", "upper"), pair, strict=True)
+            if m is not None and m <= close
+        ]
+    user = enumerate(margins["user"])
+    return found + [f"constraint {i}" for i, ms in user if any(m is not None and m <= ACTIVE for m in ms)]
+
+
+def _notes(table: Identification, found: Solutions) -> list[str]:
+    discarded = int(np.sum(~table.reliable))
+    stalled = int(np.sum((found.violation == 0) & ~found.converged))
+    infeasible = int(np.sum(found.violation > 0))
+    said = [
+        (discarded, f"{discarded} coefficients were left out because they are not reliable"),
+        (stalled, f"{stalled} starts were still improving when their steps were used up"),
+        (infeasible, f"{infeasible} starts ended outside a bound or constraint and do not count"),
+    ]
+    return [text for count, text in said if count]
+
+
+def _load_starts(path: Path) -> Solutions | None:
+    if not path.is_file():
+        return None
+    with np.load(path) as arrays:
+        fields = {name: arrays[name] for name in arrays.files}
+    seconds = {name: float(fields.pop(name)) for name in ("compile_seconds", "run_seconds")}
+    return Solutions(**fields, **seconds)
