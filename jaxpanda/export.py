@@ -286,15 +286,15 @@ def _buildable(
 
 
 def not_held(arm: Arm, friction: Friction | None) -> tuple[str, ...]:
-    """What MuJoCo's joints cannot hold of the arm's own friction and that found beyond it, a sentence each."""
+    """What MuJoCo's joints cannot hold of the arm's friction, a sentence each."""
     if friction is None or friction.model == "none":
         return ()
     sentences = []
     for name, values in _laws(arm, friction).items():
         for joint in np.flatnonzero(values < 0):
             sentences.append(
-                f"{name} of {arm.joint_names[joint]} came out as {values[joint]:.4g}, which would feed energy into"
-                " the joint; 0 was written, the number is in the sidecar"
+                f"{name} of {arm.joint_names[joint]} came out as {values[joint]:.4g}, which would feed energy"
+                " into the joint; 0 was written, the number is in the sidecar"
             )
     if friction.model == "sigmoid":
         sentences.append("MuJoCo has no sigmoid friction: its level at speed was written as frictionloss")
@@ -396,10 +396,11 @@ _WRITTEN = {
 }
 """Arrays of MjModel that an export writes, in the rows of the arm."""
 _FOLLOWS = (
-    "body_subtreemass body_invweight0 body_sameframe body_simple geom_sameframe site_sameframe dof_invweight0"
-    " dof_M0 dof_length dof_simplenum tendon_invweight0 flexedge_invweight0 cam_poscom0 light_poscom0"
-    " actuator_acc0 actuator_biasprm actuator_lengthrange"
-).split()
+    *("body_subtreemass", "body_invweight0", "body_sameframe", "body_simple", "geom_sameframe"),
+    *("site_sameframe", "dof_invweight0", "dof_M0", "dof_length", "dof_simplenum", "tendon_invweight0"),
+    *("flexedge_invweight0", "cam_poscom0", "light_poscom0"),
+    *("actuator_acc0", "actuator_biasprm", "actuator_lengthrange"),
+)
 """Arrays that MuJoCo computes from those."""
 _LAYOUT = ("bvh_", "body_bvh", "M_", "B_", "D_", "mapM", "mapD", "efm", "names", "dof_Madr")
 """How MuJoCo arranges its work."""

@@ -30,6 +30,7 @@ FINGER_JOINTS = 4
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_TIES = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 _ROW, _COLUMN = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])  # of jaxpanda_kernels.inertia
 
 
@@ -371,11 +372,11 @@ def _check_loops(model: mujoco.MjModel, joints: list[int], path: Path) -> None:
     bodies = set(model.jnt_bodyid[joints].tolist())
     owner = _owners(model, joints)
     for eq in range(model.neq):
-        kind, a, b = model.eq_type[eq], int(model.eq_obj1id[eq]), int(model.eq_obj2id[eq])
+        kind, a, b = int(model.eq_type[eq]), int(model.eq_obj1id[eq]), int(model.eq_obj2id[eq])
         name = model.equality(eq).name or f"number {eq + 1}"
         if kind == mujoco.mjtEq.mjEQ_JOINT:
             closes = a in joints or b in joints
-        elif kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
+        elif kind in _TIES:
             if model.eq_objtype[eq] == mujoco.mjtObj.mjOBJ_SITE:
                 a, b = int(model.site_bodyid[a]), int(model.site_bodyid[b])
             # Fingers belong to the last link, so a loop within the gripper has one owner on both sides.
