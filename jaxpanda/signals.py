@@ -386,11 +386,11 @@ def _clocks(signals: Sequence[Signals]) -> list[tuple[float, float, float, bool]
     offsets = [0.0] * len(signals)
     group = list(range(len(signals)))
     for a, b in itertools.combinations(range(len(signals)), 2):
-        found = (
-            _shift(signals[a].time, signals[a].q, signals[b].time, signals[b].q) if group[b] == b else None
-        )
-        if found is not None:
-            offsets[b], group[b] = offsets[a] + found[0], group[a]
+        found = _shift(signals[a].time, signals[a].q, signals[b].time, signals[b].q)
+        if found is not None and group[a] != group[b]:
+            move, joining = offsets[a] + found[0] - offsets[b], group[b]
+            for j in [j for j, g in enumerate(group) if g == joining]:
+                offsets[j], group[j] = offsets[j] + move, group[a]
     clocks = []
     for i, offset in enumerate(offsets):
         members = [j for j in range(len(signals)) if group[j] == group[i]]

@@ -271,6 +271,16 @@ def test_recordings_of_the_same_motion_share_their_blocks():
                 assert np.min(np.abs(train[:, None] - test[None, :])) > 0.09
 
 
+def test_recordings_linked_by_a_third_share_their_blocks():
+    starts = (0.0, 9.5, 5.0)
+    made = [prepare(recording(10.0, q=lambda t, start=start: sweep(t + start))) for start in starts]
+    clocks = [s.times + start for s, start in zip(made, starts, strict=True)]
+    for splits in blocks_many(made, folds=3):
+        trained = np.concatenate([clock[train] for clock, (train, _) in zip(clocks, splits, strict=True)])
+        tested = np.concatenate([clock[test] for clock, (_, test) in zip(clocks, splits, strict=True)])
+        assert np.min(np.abs(trained[:, None] - tested[None, :])) > 0.09
+
+
 def test_the_log_of_gaz_et_al_repeats_and_shows_its_noise_floor(data):
     made = prepare(load(data / "gaz_panda"))
     assert made.repairs["grid points filled where rows are missing"] == 1688

@@ -50,8 +50,8 @@ def _finite(recording: Recording, row: Callable[[int], str]) -> None:
         if bad.size:
             more = f" and {bad.size - 1} more below it" if bad.size > 1 else ""
             raise InputError(
-                f"{recording.name}: column {name}, {row(int(bad[0]))}: the value is {column[bad[0]]}{more}, where "
-                "a finite number is needed; leave out the rows that were not measured"
+                f"{recording.name}: column {name}, {row(int(bad[0]))}: the value is {column[bad[0]]}{more}, "
+                "where a finite number is needed; leave out the rows that were not measured"
             )
 
 
