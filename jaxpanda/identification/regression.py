@@ -1,0 +1,194 @@
+r"""Least squares of filtered torque on filtered regressors, joint by joint.
+
+$$F\tau_j = F Y_j(q, \dot q, \ddot q)\,\beta + F \psi(\dot q_j)\,\theta_j + e_j$$
+
+$F$ is the same zero-phase low-pass for every column and for the torque ("parallel filtering"), so that it
+changes the noise and not the parameters. Joints are kept apart until the last step: each has its own noise.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxpanda_kernels import Chain, regressor
+from jaxtyping import Array, Bool, Float, Int
+
+from ..arm import Arm
+from ..errors import InputError
+from ..friction import columns
+from ..parameters import Base, base_parameters
+from ..signals import Signals
+
+_CHUNK = 1024  # samples whose regressor is evaluated at once; bounds the memory
+_REWEIGHTINGS = 2  # after the first, joint weights change by less than a percent
+_LEAST_SIGMA = 1e-9  # of the torque: below it a residual is round-off, as on noise-free data
+UNDETERMINED = 1e-9
+"""Singular values of unit-length columns below this share of the largest tell nothing."""
+
+Masks = Sequence[Bool[np.ndarray, " time"]]
+"""Which samples of each recording to use."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Regression:
+    """One recording, filtered: what each joint's torque should be a combination of."""
+
+    name: str
+    A: Float[np.ndarray, "dof time columns"]
+    """Base parameters' columns, then the friction's, all of joint 1 first."""
+    y: Float[np.ndarray, "dof time"]
+    """Measured torque less what the arm's model holds beyond rigid links [N m]."""
+    tau: Float[np.ndarray, "dof time"]
+    """Measured torque [N m]: what relative errors are relative to."""
+    duration: float
+    """[s]"""
+    duration: float
+    """[s]"""
+
+    def residual(self, x: Float[np.ndarray, " columns"]) -> Float[np.ndarray, "dof time"]:
+        """What the unknowns `x` leave of the torque [N m]."""
+        return self.y - self.A @ x
+
+
+def regression(signals: Signals, arm: Arm, base: Base, friction: str) -> Regression:
+    """Filter one recording's torque, its regressor and the columns of a linear friction model alike.
+
+    Raises:
+        InputError: the recording has no torque, or another number of joints than the arm.
+    """
+    if signals.tau is None:
+        raise InputError(
+            f"{signals.name}: has no columns tau_1 ...; identification needs the measured torque"
+        )
+    if signals.dof != arm.dof:
+        raise InputError(f"{signals.name}: has {signals.dof} joints, but the arm {arm.name} has {arm.dof}")
+    q, qd, qdd = jnp.asarray(signals.q), jnp.asarray(signals.qd), jnp.asarray(signals.qdd)
+    tau = signals.lowpass(signals.tau).T
+    known = signals.lowpass(np.asarray(jax.vmap(arm.known_torque)(q, qd, qdd))).T
+    independent = jnp.asarray(base.independent, int)
+    rigid = np.stack(
+        [
+            signals.lowpass(np.asarray(base_rows(arm.chain, independent, joint, q, qd, qdd)))
+            for joint in range(arm.dof)
+        ]
+    )
+    own = signals.lowpass(np.asarray(columns(friction, qd)))
+    A = with_columns(rigid, np.moveaxis(own, 1, 0))
+    for what, values in (("torque", tau), ("motion", A), ("torque of the model's own joint physics", known)):
+        if not np.all(np.isfinite(values)):
+            raise InputError(
+                f"{signals.name}: the filtered {what} is not finite; jaxpanda inspect shows where"
+            )
+    return Regression(signals.name, A, tau - known, tau, len(signals.keep) / signals.output_rate)
+
+
+def with_columns(
+    rigid: Float[np.ndarray, "dof time base"], own: Float[np.ndarray, "dof time extra"]
+) -> Float[np.ndarray, "dof time columns"]:
+    """The rigid columns, and beside them each joint's own ones, which no other joint feels."""
+    dof, _, extra = own.shape
+    blocks = np.zeros((*own.shape[:2], dof * extra))
+    for joint in range(dof):
+        blocks[joint, :, joint * extra : (joint + 1) * extra] = own[joint]
+    return np.concatenate([rigid, blocks], -1)
+
+
+@jax.jit
+def base_rows(
+    chain: Chain,
+    independent: Int[Array, " base"],
+    joint: int | Int[Array, ""],
+    q: Float[Array, "time dof"],
+    qd: Float[Array, "time dof"],
+    qdd: Float[Array, "time dof"],
+) -> Float[Array, "time base"]:
+    """One joint's rows of the regressor, independent columns only.
+
+    One joint at a time, since a long recording's whole regressor would not fit in memory.
+    """
+
+    def row(sample):
+        return regressor(chain, *sample)[joint].ravel()[independent]
+
+    return jax.lax.map(row, (q, qd, qdd), batch_size=_CHUNK)
+
+
+def everything(regressions: Sequence[Regression]) -> Masks:
+    """Masks that leave nothing out."""
+    return [np.ones(r.y.shape[1], bool) for r in regressions]
+
+
+def excited(regressions: Sequence[Regression], base: Base) -> tuple[list[Regression], Base]:
+    """The problem in as many base parameters as the recordings excite, exactly the given ones if all of them.
+
+    A recording at rest, say, tells gravity parameters only.
+    """
+    R = np.concatenate(triangles(regressions, everything(regressions)))[:, : base.rank]
+    norms = np.linalg.norm(R, axis=0)
+    s = np.linalg.svd(R / np.where(norms > 0, norms, 1), compute_uv=False)
+    if norms.all() and s[-1] > UNDETERMINED * s[0]:
+        return list(regressions), base
+    fewer = base_parameters(R @ base.projection, tolerance=UNDETERMINED)
+    places = [base.independent.index(k) for k in fewer.independent]
+    rest = range(base.rank, regressions[0].A.shape[2])
+    return [dataclasses.replace(r, A=r.A[:, :, [*places, *rest]]) for r in regressions], fewer
+
+
+def triangles(regressions: Sequence[Regression], masks: Masks) -> Float[np.ndarray, "dof rows columns"]:
+    r"""The R of a QR factorisation of $[A_j\; y_j]$ a joint: all that least squares needs of the data."""
+    R = []
+    for joint in range(len(regressions[0].A)):
+        parts = [
+            np.column_stack([r.A[joint, mask], r.y[joint, mask]])
+            for r, mask in zip(regressions, masks, strict=True)
+        ]
+        R.append(triangle(np.concatenate(parts)))
+    return np.stack(R)
+
+
+def triangle(rows: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
+    """R, padded with rows of zeros where there are fewer rows than columns."""
+    R: Any = np.linalg.qr(rows, mode="r")
+    return np.concatenate([R, np.zeros((rows.shape[1] - len(R), rows.shape[1]))])
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """A solution of a regression."""
+
+    x: Float[np.ndarray, " columns"]
+    """Base parameters, then friction."""
+    sigma: Float[np.ndarray, " dof"]
+    """Residual that each joint was weighted by [N m]; ones without weighting."""
+    phi: Float[np.ndarray, "dof 10"] | None = None
+    """Link parameters behind it, where the fit goes by them."""
+
+
+def least_squares(regressions: Sequence[Regression], masks: Masks, weighting: str) -> Fit:
+    r"""$\min_x \sum_j \lVert y_j - A_j x\rVert^2 / \sigma_j^2$.
+
+    With the weighting `joint`, $\sigma_j$ is joint j's rms residual in the fit before; with `none` it is one.
+    """
+    R = triangles(regressions, masks)
+    samples = sum(int(mask.sum()) for mask in masks)
+    least = _LEAST_SIGMA * np.linalg.norm(R[:, :, -1]) / np.sqrt(R.shape[0] * samples) + np.finfo(float).tiny
+    sigma = np.ones(len(R))
+    x = weighted_solution(R, sigma)
+    for _ in range(_REWEIGHTINGS if weighting == "joint" else 0):
+        residual = R @ np.append(-x, 1.0)
+        sigma = np.maximum(np.linalg.norm(residual, axis=1) / np.sqrt(samples), least)
+        x = weighted_solution(R, sigma)
+    return Fit(x, sigma)
+
+
+def weighted_solution(
+    R: Float[np.ndarray, "dof rows columns"], sigma: Float[np.ndarray, " dof"]
+) -> Float[np.ndarray, " unknowns"]:
+    """Weighted least squares from the joints' triangles; zero along directions without information."""
+    rows = np.concatenate(R / sigma[:, None, None])
+    norms = np.linalg.norm(rows[:, :-1], axis=0)
+    scale = np.where(norms > 0, norms, 1.0)
+    return np.linalg.lstsq(rows[:, :-1] / scale, rows[:, -1], rcond=UNDETERMINED)[0] / scale

@@ -1,0 +1,83 @@
+r"""How sure a least-squares estimate is, where its residuals are not white.
+
+With weights $w_j = 1/\sigma_j^2$ and $H = \sum_j w_j A_j^\top A_j$ the textbook covariance is $s^2 H^{-1}$:
+every sample of every joint counts as independent. Filtered samples are not, and what a rigid model leaves is
+mostly missing physics, smooth in time and common to several joints: those deviations are several times too
+small.
+
+The delete-a-block jackknife asks the data instead. With block b left out the estimate moves by
+
+$$\Delta_b = -(H - H_b)^{-1} \sum_{t \in b} \sum_j w_j\, a_{jt} e_{jt}, \qquad
+  \mathrm{cov} = \frac{B - 1}{B} \sum_b (\Delta_b - \bar\Delta)(\Delta_b - \bar\Delta)^\top .$$
+
+It needs blocks longer than the correlation of the residual and no model of it. On the Panda's exciting
+trajectory with noise of known parameters (white, correlated over 0.2 s, common to all joints; low-passed at 2
+and 5 Hz) its 95 % intervals held the truth 93 to 96 % of the time, the textbook's 25 to 45 %, and those of a
+long-run covariance (Newey and West's) 80 to 93 %: residuals of 64 fitted parameters are smaller than errors.
+
+References:
+    Künsch, "The jackknife and the bootstrap for general stationary observations", Annals of Statistics 1989;
+    MacKinnon and White, J. Econometrics 1985 (the jackknife and leverage).
+"""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .regression import UNDETERMINED, Regression
+
+BLOCKS = 20
+"""Blocks of the jackknife: a second each in a recording of 20 s."""
+
+
+def covariances(
+    regressions: Sequence[Regression], x: Float[np.ndarray, " unknowns"], sigma: Float[np.ndarray, " dof"]
+) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, "unknowns unknowns"]]:
+    """Covariance of weighted least squares: by the jackknife, and by the textbook."""
+    weights = 1 / sigma**2
+    H = np.zeros((len(x), len(x)))
+    informations, scores, total, squares = [], [], 0, 0.0
+    for r in regressions:
+        e = r.residual(x)
+        total += e.size
+        squares += float(np.sum(weights[:, None] * e**2))
+        for block in _cut(
+            e.shape[1], max(2, round(BLOCKS * e.shape[1] / sum(s.y.shape[1] for s in regressions)))
+        ):
+            A = r.A[:, block]
+            informations.append(np.einsum("j,jta,jtb->ab", weights, A, A, optimize=True))
+            scores.append(np.einsum("j,jta,jt->a", weights, A, e[:, block], optimize=True))
+            H += informations[-1]
+    scale = np.sqrt(np.where(np.diag(H) > 0, np.diag(H), 1.0))
+    scaling = np.outer(scale, scale)
+    moves = np.stack(
+        [-_inverse((H - Hb) / scaling) @ (s / scale) for Hb, s in zip(informations, scores, strict=True)]
+    )
+    moves -= moves.mean(0)
+    robust = (len(moves) - 1) / len(moves) * moves.T @ moves
+    classical = squares / max(total - len(x), 1) * _inverse(H / scaling)
+    return robust / scaling, classical / scaling
+
+
+def determined(
+    regressions: Sequence[Regression], sigma: Float[np.ndarray, " dof"]
+) -> Bool[np.ndarray, " unknowns"]:
+    """Which unknowns the data tell at all: those without part in any direction that moves no torque."""
+    H = np.sum([np.einsum("j,jta,jtb->ab", 1 / sigma**2, r.A, r.A, optimize=True) for r in regressions], 0)
+    scale = np.sqrt(np.where(np.diag(H) > 0, np.diag(H), 1.0))
+    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
+    null = vectors[:, values < UNDETERMINED**2 * values[-1] + 1e-14 * len(H)]
+    return np.sum(null**2, axis=1) < 1e-6
+
+
+def _cut(samples: int, blocks: int) -> list[slice]:
+    edges = np.linspace(0, samples, min(blocks, samples) + 1).round().astype(int)
+    return [slice(a, b) for a, b in itertools.pairwise(edges)]
+
+
+def _inverse(H: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Inverse of an information matrix; enormous, but finite, where there is none."""
+    values, vectors = np.linalg.eigh(H)
+    return (vectors / np.maximum(values, 1e-14)) @ vectors.T

@@ -1,0 +1,302 @@
+"""Identification from recordings of a moving arm: classical, and in one step to feasible links."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..arm import Arm
+from ..errors import InputError, require_x64
+from ..feasible import Bounds, Constraint
+from ..friction import LINEAR, MODELS, Friction, check_model
+from ..parameters import Base, arm_base_parameters
+from ..recordings import Recording
+from ..signals import Signals, blocks_many, prepare, repeatability
+from .one_step import PRIOR, Prior, feasible_least_squares
+from .regression import Fit, Masks, Regression, everything, excited, least_squares, regression, triangle
+from .result import RELIABLE, Identification
+from .sigmoid import Shape, fit_shape, linearised, with_shape
+from .statistics import covariances, determined
+
+STARTS = 16
+"""Starts of the one-step fit, the nominal links first: its problem has one basin, so that few are enough."""
+_SHAPE_ROUNDS = 2  # the sigmoid's shape depends on the joints' weights, and these on the shape
+
+
+def identify(
+    recordings: Recording | Sequence[Recording],
+    arm: Arm,
+    *,
+    method: str = "trajectory",
+    friction: str = "coulomb_viscous_offset",
+    weighting: str = "joint",
+    cutoff: float = 5.0,
+    folds: int = 5,
+    bounds: Bounds | None = None,
+    constraints: Sequence[Constraint] = (),
+    prior: float = PRIOR,
+    starts: int = STARTS,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Identification:
+    """Base parameters and friction of an arm from recordings of its motion and torque.
+
+    What the arm's model holds beyond rigid links (armature, damping, frictionloss, springs) counts as known:
+    the friction found comes on top of it.
+
+    Args:
+        recordings: one or more, of the same arm.
+        arm: for its geometry and what is known.
+        method: `trajectory`, classical least squares in base parameters, or `one_step`, link parameters that
+            could be built straight from torque.
+        friction: a model of `jaxpanda.friction`.
+        weighting: `joint`, each joint by its residual, or `none`.
+        cutoff: of the zero-phase low-pass on both sides [Hz].
+        folds: of the cross-validation; blocks never split a repeat of the motion. 0 leaves it out.
+        bounds: of the links' parameters (`one_step`); published ones for the Panda, else around the arm's.
+        constraints: further ones (`one_step`), as functions of `jaxpanda.feasible.Links`.
+        prior: how far links are expected from the arm's nominal ones, as a share of them (`one_step`);
+            infinite for no expectation.
+        starts: random starts of the one-step fit.
+        seed: of those starts.
+        progress: called with (fits done, fits).
+
+    Raises:
+        InputError: bad recordings or an unknown option.
+    """
+    require_x64("identification")
+    check_model(friction)
+    for name, value, known in (
+        ("method", method, ("trajectory", "one_step")),
+        ("weighting", weighting, ("joint", "none")),
+    ):
+        if value not in known:
+            raise InputError(f"{name}: {value!r} is none of {', '.join(known)}")
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    if not recordings:
+        raise InputError("recordings: none given; identification needs at least one")
+    signals = [prepare(recording, cutoff=cutoff) for recording in recordings]
+    problem = _pose(signals, arm, friction, weighting)
+    if method == "one_step":
+        bounds = bounds or (Bounds.panda() if arm.name == "panda" else Bounds.around(arm))
+        if bounds.dof != arm.dof:
+            raise InputError(f"bounds: of {bounds.dof} links, but the arm {arm.name} has {arm.dof}")
+        if not prior > 0:
+            raise InputError(f"prior: {prior!r} is no positive share of the nominal parameters")
+        options = {"bounds": bounds, "prior": Prior.around(arm, bounds, prior), "cutoff": cutoff}
+        solver = partial(_feasible, problem, constraints=constraints, starts=starts, seed=seed, **options)
+    else:
+        solver = partial(_classical, problem)
+
+    tick = progress or (lambda done, total: None)
+    tick(0, 1 + folds)
+    whole = solver(everything(problem.rigid))
+    tick(1, 1 + folds)
+    held_out = _cross_validate(problem, solver, folds, tick) if folds else None
+    return _result(
+        problem,
+        whole,
+        held_out,
+        arm,
+        method,
+        recordings,
+        {
+            "friction": friction,
+            "weighting": weighting,
+            "cutoff": cutoff,
+            "folds": folds,
+            "derivative_cutoff": [s.derivative_cutoff for s in signals],
+            "samples": sum(len(s.keep) for s in signals),
+            "output_rate": [s.output_rate for s in signals],
+            "period": [s.period for s in signals],
+        },
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Problem:
+    """All recordings, filtered once."""
+
+    signals: Sequence[Signals]
+    rigid: Sequence[Regression]
+    """Without friction where its columns are yet to be found, else with it."""
+    base: Base
+    of_arm: int
+    """Rank of the arm itself: as many base parameters as the best motion could tell."""
+    friction: str
+    weighting: str
+
+
+@dataclasses.dataclass(frozen=True)
+class _Solved:
+    """A fit, and the linear problem it solves."""
+
+    fit: Fit
+    regressions: Sequence[Regression]
+    shape: Shape | None = None
+    settings: dict[str, Any] = dataclasses.field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+_Solver = Callable[[Masks], _Solved]
+
+
+def _pose(signals: Sequence[Signals], arm: Arm, friction: str, weighting: str) -> _Problem:
+    whole = arm_base_parameters(arm)
+    linear = friction if friction in LINEAR else "none"
+    rigid, base = excited([regression(s, arm, whole, linear) for s in signals], whole)
+    return _Problem(signals, rigid, base, whole.rank, friction, weighting)
+
+
+def _linear(problem: _Problem, masks: Masks) -> tuple[Sequence[Regression], Shape | None]:
+    """The problem with all friction columns, the sigmoid's shape found from the masked samples only."""
+    if problem.friction in LINEAR:
+        return problem.rigid, None
+    shape, regressions = None, problem.rigid
+    for _ in range(_SHAPE_ROUNDS):
+        sigma = least_squares(regressions, masks, problem.weighting).sigma
+        shape = fit_shape(problem.rigid, problem.signals, masks, sigma, shape)
+        regressions = with_shape(problem.rigid, problem.signals, shape)
+    return regressions, shape
+
+
+def _classical(problem: _Problem, masks: Masks) -> _Solved:
+    regressions, shape = _linear(problem, masks)
+    return _Solved(least_squares(regressions, masks, problem.weighting), regressions, shape)
+
+
+def _feasible(problem: _Problem, masks: Masks, **options: Any) -> _Solved:
+    regressions, shape = _linear(problem, masks)
+    fit, found = feasible_least_squares(
+        regressions, masks, problem.weighting, problem.base, problem.friction, **options
+    )
+    best = found.best
+    settings = {
+        "starts": len(found.objective),
+        "converged": int(found.converged.sum()),
+        "objective": float(found.objective[best]),
+        "max_violation": float(found.violation[best]),
+    }
+    notes = ()
+    if found.violation[best] > 0:
+        notes = (
+            f"no start met every bound and constraint; the best misses one by {found.violation[best]:.2g}",
+        )
+    return _Solved(fit, regressions, shape, settings, notes)
+
+
+def _cross_validate(
+    problem: _Problem, solver: _Solver, folds: int, tick: Callable[[int, int], None]
+) -> list[tuple[Float[np.ndarray, "dof time"], Bool[np.ndarray, " time"]]]:
+    """For each recording, residuals of samples that their fit has not seen, and which samples those are."""
+    residuals = [np.zeros_like(r.y) for r in problem.rigid]
+    seen = [np.zeros(r.y.shape[1], bool) for r in problem.rigid]
+    for k, splits in enumerate(blocks_many(problem.signals, folds)):
+        solved = solver([train for train, _ in splits])
+        for r, residual, done, (_, test) in zip(solved.regressions, residuals, seen, splits, strict=True):
+            residual[:, test] = r.residual(solved.fit.x)[:, test]
+            done |= test
+        tick(2 + k, 1 + folds)
+    return list(zip(residuals, seen, strict=True))
+
+
+def _result(
+    problem: _Problem,
+    solved: _Solved,
+    held_out: list[tuple[np.ndarray, np.ndarray]] | None,
+    arm: Arm,
+    method: str,
+    recordings: Sequence[Recording],
+    settings: dict[str, Any],
+) -> Identification:
+    fit, base, regressions = solved.fit, problem.base, solved.regressions
+    beta = fit.x[: base.rank]
+    covariance, std, textbook = _uncertainty(problem, solved)
+    e = np.concatenate([r.residual(fit.x) for r in regressions], 1)
+    unseen = unseen_percent = None
+    if held_out is not None:
+        unseen = np.concatenate([residual[:, done] for residual, done in held_out], 1)
+        tau = [r.tau[:, done] for r, (_, done) in zip(regressions, held_out, strict=True)]
+        unseen_percent = _percent(unseen, np.concatenate(tau, 1))
+    floors = [floor for s in problem.signals if (floor := repeatability(s)) is not None]
+    notes = [note for s in problem.signals for note in s.notes] + list(solved.notes)
+    if base.rank < problem.of_arm:
+        notes.append(f"the motion tells {base.rank} of the arm's {problem.of_arm} base parameters")
+    if not np.all(np.isfinite(std[base.rank :])):
+        notes.append("the motion does not tell all friction parameters; their standard deviation is null")
+    repairs = Counter()
+    for s in problem.signals:
+        repairs.update(s.repairs)
+    return Identification(
+        method=method,
+        projection=base.projection,
+        beta=beta,
+        reliable=std[: base.rank] <= RELIABLE * np.abs(beta),
+        expressions=tuple(base.expressions),
+        std=std[: base.rank],
+        classical_std=textbook[: base.rank],
+        covariance=covariance[: base.rank, : base.rank],
+        friction=_friction(problem, solved, std, arm.dof),
+        standard=fit.phi,
+        rank=base.rank,
+        condition_number=_condition(regressions),
+        relative_error_percent=_percent(e, np.concatenate([r.tau for r in regressions], 1)),
+        rmse=np.sqrt(np.mean(e**2, 1)),
+        cross_validated_rmse=None if unseen is None else np.sqrt(np.mean(unseen**2, 1)),
+        cross_validated_relative_error_percent=unseen_percent,
+        noise=np.sqrt(np.mean(np.square(floors), 0)) if floors else None,
+        arm=arm.name,
+        link_names=arm.link_names,
+        joint_names=arm.joint_names,
+        recordings=tuple(recording.name for recording in recordings),
+        settings={**settings, **solved.settings},
+        repairs=dict(repairs),
+        notes=tuple(notes),
+    )
+
+
+def _uncertainty(
+    problem: _Problem, solved: _Solved
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Robust covariance, its deviations, and the textbook's; infinite where the data do not tell."""
+    regressions, x = solved.regressions, solved.fit.x
+    if solved.shape is not None:
+        phi1 = x[problem.base.rank :]
+        regressions = linearised(problem.rigid, problem.signals, solved.shape, phi1)
+        rates = np.stack([phi1, np.zeros_like(phi1), np.zeros_like(phi1)], -1)  # the residual stays as it is
+        x = np.concatenate([x[: problem.base.rank], rates.ravel()])
+    robust, classical = covariances(regressions, x, solved.fit.sigma)
+    known = determined(regressions, solved.fit.sigma)
+    std, textbook = (np.where(known, np.sqrt(np.diag(C)), np.inf) for C in (robust, classical))
+    return robust, std, textbook
+
+
+def _friction(problem: _Problem, solved: _Solved, std: Float[np.ndarray, " n"], dof: int) -> Friction | None:
+    names = MODELS[problem.friction]
+    if not names:
+        return None
+    values = solved.fit.x[problem.base.rank :].reshape(dof, -1).T
+    if solved.shape is not None:
+        values = np.concatenate([values, solved.shape])
+    deviations = std[problem.base.rank :].reshape(dof, -1).T
+    return Friction(
+        problem.friction,
+        dict(zip(names, values, strict=True)),
+        dict(zip(names, deviations, strict=True)),
+    )
+
+
+def _condition(regressions: Sequence[Regression]) -> float | None:
+    """Condition number of the stacked columns, all joints alike; None where a column is zero."""
+    columns = np.concatenate([r.A.reshape(-1, r.A.shape[2]) for r in regressions])
+    s = np.linalg.svd(triangle(columns), compute_uv=False)
+    return float(s[0] / s[-1]) if s[-1] > 1e-14 * s[0] else None
+
+
+def _percent(e: Float[np.ndarray, "dof time"], tau: Float[np.ndarray, "dof time"]) -> float:
+    size = np.linalg.norm(tau)
+    return float(100 * np.linalg.norm(e) / size) if size else 0.0
