@@ -66,7 +66,9 @@ class Identifiable:
     condition_number: float
     """Greatest over least singular value of what the motion shows."""
     gravity_rank: int
+    """Of them, those that show at rest in the positions of the motion."""
     gravity_structural_rank: int
+    gravity_well_excited: int
     viscous_joints: tuple[int, ...]
     """Joints that move both ways at speeds that differ."""
     coulomb_joints: tuple[int, ...]
@@ -307,7 +309,7 @@ def _identifiable(
 ) -> Identifiable:
     """Ranks of the regressor at states of the motion, against random states of the same arm."""
     random = np.random.default_rng(0).uniform(-2, 2, (3, _STATES, arm.dof))
-    motion = _singular_values(at.regressor)
+    motion, gravity = _singular_values(at.regressor), _singular_values(at.gravity_regressor)
     rank = _rank(motion)
     both = [
         joint.joint for joint in joints if joint.reversals > 0 and _both_ways(signals.qd[:, joint.joint - 1])
@@ -317,7 +319,8 @@ def _identifiable(
         structural_rank=_rank(_singular_values(_stacked(arm, *random))),
         well_excited=int(np.sum(motion > WEAK * motion[0])),
         condition_number=float(motion[0] / motion[max(rank - 1, 0)]),
-        gravity_rank=_rank(_singular_values(at.gravity_regressor)),
+        gravity_rank=_rank(gravity),
+        gravity_well_excited=int(np.sum(gravity > WEAK * gravity[0])),
         gravity_structural_rank=_rank(
             _singular_values(_stacked(arm, random[0], 0 * random[0], 0 * random[0]))
         ),
@@ -442,8 +445,9 @@ def _motion_verdicts(found: Inspection) -> list[str]:
     if can is None:
         return said
     said.append(
-        f"gravity: {can.gravity_rank} of {can.gravity_structural_rank} parameters show"
-        + ("" if can.gravity_rank == can.gravity_structural_rank else ": move more joints, further")
+        f"gravity: {can.gravity_rank} of {can.gravity_structural_rank} parameters show, "
+        f"{can.gravity_well_excited} of them well"
+        + ("" if can.gravity_well_excited == can.gravity_structural_rank else ": move more joints, further")
     )
     said.append(
         f"inertia: {can.rank} of {can.structural_rank} base parameters show, {can.well_excited} of them well "
