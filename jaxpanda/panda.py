@@ -27,11 +27,11 @@ def panda() -> Arm:
     table = published()
     dh = table["modified_dh"]
     dof = len(dh["a"])
-    coms = np.array([link["com"] for link in table["links"]])
+    coms = np.array([link["com"] for link in table["retrieved_links"]])
     coms[5, 2] = table["c6z_corrected"]
-    xx, yy, zz, xy, xz, yz = np.array([link["inertia"] for link in table["links"]]).T
+    xx, yy, zz, xy, xz, yz = np.array([link["inertia"] for link in table["retrieved_links"]]).T
     I_com = np.moveaxis(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), -1, 0)
-    mass = jnp.array([link["mass"] for link in table["links"]])
+    mass = jnp.array([link["mass"] for link in table["retrieved_links"]])
     zero = jnp.zeros(dof)
     return Arm(
         chain=from_modified_dh(
