@@ -1,0 +1,7 @@
+"""Which physics a model is missing: located, named, modelled, and shown to help."""
+
+from .diagnosis import Diagnosis as Diagnosis
+from .diagnosis import Finding as Finding
+from .diagnosis import Fit as Fit
+from .diagnosis import diagnose as diagnose
+from .diagnosis import predict as predict

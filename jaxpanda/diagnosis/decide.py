@@ -1,0 +1,185 @@
+"""From accepted terms to findings: merged, weighed against their rivals, and said in words."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.special
+from jaxtyping import Float
+
+from ..effects import CATALOGUE
+from .problem import Problem, Term
+from .search import ACCEPT, State, ranked
+
+TEMPERATURE = 3.0
+"""By which differences of evidence are divided: models are never quite right, so evidence overstates."""
+_LISTED = 0.01
+"""Probability from which a rival is listed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One effect that the model was missing."""
+
+    effect: str
+    joints: tuple[int, ...]
+    """0-based."""
+    recordings: tuple[str, ...]
+    intervals: tuple[tuple[float, float], ...] | None
+    confidence: float
+    alternatives: tuple[tuple[str, float], ...]
+    equation: str
+    parameters: tuple[Mapping[str, Any], ...]
+    rms_torque: Float[np.ndarray, " dof"]
+    evidence: float
+    """Over the model without it [nats]."""
+    summary: str
+    terms: tuple[int, ...]
+    """Which terms of the model it consists of."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "effect": self.effect,
+            "joints": [j + 1 for j in self.joints],
+            "recordings": list(self.recordings),
+            "intervals": None if self.intervals is None else [list(pair) for pair in self.intervals],
+            "confidence": self.confidence,
+            "alternatives": [{"effect": name, "confidence": p} for name, p in self.alternatives],
+            "equation": self.equation,
+            "parameters": [dict(p) for p in self.parameters],
+            "rms_torque": [float(v) for v in self.rms_torque],
+            "evidence_nats": self.evidence,
+            "summary": self.summary,
+        }
+
+
+def findings(problem: Problem, state: State) -> list[Finding]:
+    """The accepted terms as findings, those that explain most first."""
+    order: dict[tuple, list[int]] = {}
+    for i, term in enumerate(state.terms):
+        order.setdefault(_together(term), []).append(i)
+    rivals = [_rivals(problem, state, i) for i in range(len(state.terms))]
+    out = [_finding(problem, state, places, rivals) for places in order.values()]
+    return sorted(out, key=lambda f: -f.evidence)
+
+
+def _together(term: Term) -> tuple:
+    """What makes terms one finding."""
+    effect = term.effect
+    if effect.bound_to_recording:
+        return effect.name, effect.joints, getattr(effect, "recording", "")
+    return (effect.name,)
+
+
+def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, float], float]:
+    """Evidence of a term, probability of each effect in its place, its own included."""
+    term = state.terms[i]
+    others = (*state.terms[:i], *state.terms[i + 1 :])
+    design = problem.design(others, state.noise)
+    evidence = state.design.log_evidence - design.log_evidence
+    by_name: dict[str, float] = {}
+    for proposal in ranked(problem, design, state.noise):
+        name = proposal.effect.name
+        by_name[name] = max(by_name.get(name, -np.inf), proposal.evidence)
+    names = list(by_name)
+    weights = np.array([by_name[n] for n in names] + [ACCEPT - 4.0]) / TEMPERATURE
+    posterior = np.exp(weights - scipy.special.logsumexp(weights))
+    probability = dict(zip(names, posterior.tolist(), strict=False))
+    return evidence, probability, probability.get(term.effect.name, 0.0)
+
+
+def coefficients(
+    problem: Problem, state: State, i: int
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+    """Coefficients of a term, and their covariance."""
+    before = problem.nuisance[0].shape[2] + sum(len(t.deviation) for t in state.terms[:i])
+    place = slice(before, before + len(state.terms[i].deviation))
+    return state.design.x[place], state.design.covariance[place, place]
+
+
+def torque(problem: Problem, state: State, i: int) -> list[Float[np.ndarray, "time dof"]]:
+    """Torque of a term in each recording [N m]."""
+    c, _ = coefficients(problem, state, i)
+    return [columns @ c for columns in state.terms[i].columns]
+
+
+def _finding(problem: Problem, state: State, places: Sequence[int], rivals: Sequence) -> Finding:
+    terms = [state.terms[i] for i in places]
+    effect = terms[0].effect
+    joints = tuple(sorted({j for t in terms for j in t.effect.joints}))
+    parts = [torque(problem, state, i) for i in places]
+    together = [np.sum([part[r] for part in parts], 0) for r in range(len(problem.traces))]
+    names = [t.name for t, on in zip(problem.traces, problem.active, strict=True) if on]
+    intervals = None
+    acting = [np.ones(len(x), bool) for x in together]
+    if effect.bound_to_recording:
+        names = [getattr(effect, "recording", names[0])]
+        intervals = _intervals(problem, terms)
+        acting = [np.any(x != 0, axis=1) for x in together]
+    felt = np.concatenate(
+        [x[on] for x, on, active in zip(together, acting, problem.active, strict=True) if active]
+    )
+    rms = np.sqrt(np.mean(felt**2, 0)) if len(felt) else np.zeros(problem.dof)
+    parameters, equations = [], []
+    for i, term in zip(places, terms, strict=True):
+        c, covariance = coefficients(problem, state, i)
+        parameters += term.effect.parameters(c, covariance)
+        if term.effect.equation not in equations:
+            equations.append(term.effect.equation)
+    own = min(rivals[i][2] for i in places)
+    weakest = min(places, key=lambda i: rivals[i][2])
+    alternatives = sorted(
+        ((n, p) for n, p in rivals[weakest][1].items() if n != effect.name and p >= _LISTED),
+        key=lambda pair: -pair[1],
+    )
+    return Finding(
+        effect=effect.name,
+        joints=joints,
+        recordings=tuple(names),
+        intervals=intervals,
+        confidence=float(np.clip(own, 0.0, 0.995)),
+        alternatives=tuple(alternatives[:4]),
+        equation="; ".join(equations),
+        parameters=tuple(parameters),
+        rms_torque=rms,
+        evidence=float(sum(rivals[i][0] for i in places)),
+        summary=_summary(effect.name, joints, rms, intervals, names, alternatives, problem, own),
+        terms=tuple(places),
+    )
+
+
+def _intervals(problem: Problem, terms: Sequence[Term]) -> tuple[tuple[float, float], ...]:
+    """When the terms act [s], what touches joined."""
+    trace = next(t for t in problem.traces if t.name == getattr(terms[0].effect, "recording", t.name))
+    first, last = float(trace.channels.t[0]), float(trace.channels.t[-1])
+    spans = sorted((max(first, float(t.effect.start)), min(last, float(t.effect.stop))) for t in terms)  # pyright: ignore
+    joined = [spans[0]]
+    for start, stop in spans[1:]:
+        if start <= joined[-1][1] + 0.15:
+            joined[-1] = (joined[-1][0], max(joined[-1][1], stop))
+        else:
+            joined.append((start, stop))
+    return tuple(joined)
+
+
+def _summary(name, joints, rms, intervals, recordings, alternatives, problem, own) -> str:
+    """One or two plain sentences."""
+    strongest = int(np.argmax(rms))
+    where = "" if len(joints) in (0, problem.dof) else f" at joint{'s' * (len(joints) > 1)} {_listed(joints)}"
+    when = ""
+    if intervals is not None:
+        when = " in " + recordings[0] + " from " + ", ".join(f"{a:.2f} s to {b:.2f} s" for a, b in intervals)
+    text = (
+        f"The simulation is missing {name.replace('_', ' ')}{where}{when}: up to {rms[strongest]:.3g} N·m rms,"
+        f" at joint {strongest + 1}."
+    )
+    if alternatives and own < 0.9:
+        rival = alternatives[0][0]
+        cls = next(c for c in CATALOGUE if c.name == name)
+        text += f" These recordings could also mean {rival.replace('_', ' ')}; {cls.reveals} would tell."
+    return text
+
+
+def _listed(joints: Sequence[int]) -> str:
+    return ", ".join(str(j + 1) for j in joints)

@@ -1,0 +1,261 @@
+"""`diagnose`: from a simulation and recordings to the physics that it is missing; and `predict` from what it found."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.interpolate
+from jaxtyping import Float
+
+from .. import files
+from .. import signals as signals_
+from ..arm import Arm
+from ..corrected import SCHEMA, Corrected
+from ..errors import InputError, require_x64
+from ..export import export_mjcf, write_parameters
+from ..mjcf import MjcfSource, from_mjcf
+from ..recordings import Recording, load
+from . import knowledge as knowledge_
+from .decide import Finding, coefficients, findings
+from .problem import Problem
+from .search import State, search
+from .traces import Trace, held_sign, prepare
+
+CORRECTED = "corrected.json"
+"""What `predict` reads."""
+_FOLDS = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """How well torque is reproduced, in the band of the diagnosis [N m]."""
+
+    rmse_before: Float[np.ndarray, " dof"]
+    rmse_after: Float[np.ndarray, " dof"]
+    held_out_rmse_before: Float[np.ndarray, " dof"]
+    held_out_rmse_after: Float[np.ndarray, " dof"]
+    noise_floor: Float[np.ndarray, " dof"]
+
+    def to_json(self) -> dict[str, list[float]]:
+        return {f.name: [float(v) for v in getattr(self, f.name)] for f in dataclasses.fields(self)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """What the simulation is missing, and the simulation with it."""
+
+    verdict: str
+    findings: tuple[Finding, ...]
+    fit: Fit
+    corrected: Corrected
+    corrected_xml: str
+    notes: tuple[str, ...]
+    """What was done to the recordings, and what the corrected file cannot hold."""
+    log: tuple[str, ...]
+    """What the search tried, in its order."""
+    problem: Problem = dataclasses.field(repr=False)
+    state: State = dataclasses.field(repr=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """diagnosis.json."""
+        return {
+            "schema": "jaxpanda.diagnosis/1",
+            "verdict": self.verdict,
+            "findings": [f.to_json() for f in self.findings],
+            "fit": self.fit.to_json(),
+            "notes": list(self.notes),
+            "log": list(self.log),
+        }
+
+    def save(self, folder: str | Path) -> None:
+        """Write diagnosis.json, corrected.xml and corrected.json; all or nothing."""
+        with files.output_folder(folder) as scratch:
+            files.write_json(scratch / "diagnosis.json", self.to_json())
+            files.write_text(scratch / "corrected.xml", self.corrected_xml)
+            files.write_json(
+                scratch / CORRECTED,
+                {**self.corrected.to_json(), "torque_noise": [float(v) for v in self.fit.noise_floor]},
+            )
+
+
+def diagnose(
+    model: str | Path,
+    recordings: Sequence[str | Path | Recording],
+    *,
+    reference: Sequence[str | Path | Recording] = (),
+    knowledge: knowledge_.Knowledge = "identified",
+) -> Diagnosis:
+    """Say which physics a simulation is missing.
+
+    Args:
+        model: the simulation (MJCF) as the user has it.
+        recordings: of the arm, with torque.
+        reference: recordings of the same arm from when nothing was wrong; what they show is not reported.
+        knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` says what the words mean.
+
+    Raises:
+        InputError: a file that cannot be read, or a recording that does not fit the model.
+    """
+    require_x64("a diagnosis")
+    knowledge_.check(knowledge)
+    arm, source = from_mjcf(model)
+    if not recordings:
+        raise InputError("no recording: a diagnosis needs at least one")
+    traces, active = [], []
+    for group, on in ((recordings, True), (reference, False)):
+        for one in group:
+            recording = one if isinstance(one, Recording) else load(one)
+            recording.require_dof(arm.dof)
+            recording.require_tau()
+            traces.append(prepare(recording, arm))
+            active.append(on)
+    problem, spread = pose(tuple(traces), tuple(active), knowledge)
+    log: list[str] = []
+    state = search(problem, log)
+    found = tuple(findings(problem, state))
+    corrected = _corrected(arm, problem, state, spread)
+    text, warnings = _corrected_xml(source, corrected)
+    repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
+    return Diagnosis(
+        verdict="explained" if found else "consistent",
+        findings=found,
+        fit=fit(problem, state),
+        corrected=corrected,
+        corrected_xml=text,
+        notes=(*repairs, *(n for t in traces for n in t.signals.notes), *warnings),
+        log=tuple(log),
+        problem=problem,
+        state=state,
+    )
+
+
+def pose(
+    traces: tuple[Trace, ...], active: tuple[bool, ...], knowledge: knowledge_.Knowledge
+) -> tuple[Problem, Float[np.ndarray, "standard n"]]:
+    """The problem, and the spread of the inertial parameters behind its first nuisance columns."""
+    arm = traces[0].motion.arm
+    empty = Problem(traces, active, tuple(t.motion.q[:, :, None][:, :, :0] for t in traces))
+    spread = knowledge_.inertial_spread(arm, knowledge, empty.noise(()).std)
+    return Problem(traces, active, tuple(knowledge_.nuisance(traces, spread, knowledge))), spread
+
+
+def fit(problem: Problem, state: State) -> Fit:
+    """Errors before and after; held out: coefficients refitted without the block that is tested."""
+    before = [r * t.weight[:, None] for r, t in zip(problem.residual, problem.traces, strict=True)]
+    everything = [
+        np.concatenate([n, *(t.columns[i] for t in state.terms)], 2) for i, n in enumerate(problem.nuisance)
+    ]
+    after = [
+        (r - c @ state.design.x) * t.weight[:, None]
+        for r, c, t in zip(problem.residual, everything, problem.traces, strict=True)
+    ]
+    held = held_out(problem, state)
+    return Fit(_rms(before), _rms(after), _rms([b[m] for b, (_, m) in zip(before, held, strict=True)]),
+               _rms([e[m] for e, m in held]), state.noise.std)  # fmt: skip
+
+
+def held_out(problem: Problem, state: State) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For each recording: errors [N m] with the samples' own block left out of the fit, and where they count.
+
+    What happened once in a recording has no second instance to be tested on: those samples are left out.
+    """
+    bound = [t for t in state.terms if t.effect.bound_to_recording]
+    folds = signals_.blocks_many([t.signals for t in problem.traces], _FOLDS)
+    out = []
+    for r, trace in enumerate(problem.traces):
+        counts = trace.weight > 0
+        for term in bound:
+            counts = counts & ~np.any(term.columns[r] != 0, axis=(1, 2))
+        out.append((problem.residual[r].copy(), counts))
+    everything = [
+        np.concatenate([n, *(t.columns[i] for t in state.terms)], 2) for i, n in enumerate(problem.nuisance)
+    ]
+    for splits in folds:
+        traces = tuple(
+            dataclasses.replace(t, weight=t.weight * train)
+            for t, (train, _) in zip(problem.traces, splits, strict=True)
+        )
+        x = dataclasses.replace(problem, traces=traces).design(state.terms, state.noise).x
+        for r, (_, test) in enumerate(splits):
+            out[r][0][test] -= everything[r][test] @ x
+    return out
+
+
+def _rms(parts: Sequence[np.ndarray]) -> np.ndarray:
+    stacked = np.concatenate(list(parts))
+    return np.sqrt(np.mean(stacked**2, 0)) if len(stacked) else np.zeros(stacked.shape[1])
+
+
+def _corrected(arm: Arm, problem: Problem, state: State, spread: np.ndarray) -> Corrected:
+    """The arm with the terms, and with what they leave of the nuisance; as it was where nothing was found."""
+    change, damping, level = np.zeros((arm.dof, 10)), np.zeros(arm.dof), np.zeros(arm.dof)
+    if state.terms:
+        x = state.design.x
+        change = (spread @ x[: spread.shape[1]]).reshape(arm.dof, 10)
+        k = spread.shape[1]
+        share = x[k : problem.nuisance[0].shape[2]]
+        held = [(damping, np.asarray(arm.damping)), (level, np.asarray(arm.frictionloss))]
+        places = [(out, j, value[j]) for out, value in held for j in np.flatnonzero(value > 0)]
+        for (out, j, value), one in zip(places, share, strict=False):
+            out[j] = one * value
+    return Corrected(
+        arm,
+        jnp.asarray(change),
+        jnp.asarray(damping),
+        jnp.asarray(level),
+        tuple(t.effect for t in state.terms),
+        tuple(jnp.asarray(coefficients(problem, state, i)[0]) for i in range(len(state.terms))),
+    )
+
+
+def _corrected_xml(source: MjcfSource, corrected: Corrected) -> tuple[str, tuple[str, ...]]:
+    """The user's file with what MuJoCo holds natively put in, and what could not be."""
+    if not corrected.effects:
+        return source.text, ()
+    native = corrected.native
+    moved = any(hasattr(e, "standard_change") for e in corrected.effects)
+    warnings: list[str] = []
+    arm = Arm(
+        corrected.arm.chain, corrected.arm.standard, *(jnp.maximum(getattr(native, n), 0.0) for n in
+        ("armature", "damping", "frictionloss", "stiffness")), native.springref, native.lower, native.upper,
+        native.joint_names, native.link_names, native.name,
+    )  # fmt: skip
+    try:
+        result = write_parameters(source, arm, np.asarray(native.standard) if moved else None)
+    except InputError as error:
+        warnings.append(f"corrected.xml: link inertias are left as they were: {error}")
+        result = write_parameters(source, arm, None)
+    text = result.text
+    if not np.allclose(np.asarray(native.chain.gravity), np.asarray(corrected.arm.chain.gravity)):
+        value = " ".join(repr(float(v)) for v in np.asarray(native.chain.gravity))
+        try:
+            text = export_mjcf(text, {("option", ""): {"gravity": value}})
+        except InputError as error:
+            warnings.append(f"corrected.xml: gravity should be {value}: {error}")
+    warnings += [f"corrected.xml cannot hold {e.name}: {e.equation}" for e, _ in corrected.beyond]
+    return text, (*warnings, *result.warnings)
+
+
+def predict(folder: str | Path, motion: str | Path | Recording) -> Float[np.ndarray, "rows dof"]:
+    """Torque [N m] that the sensors would measure, for each row of a motion, from what `diagnose` saved.
+
+    Raises:
+        InputError: no saved diagnosis in the folder, or a motion of another arm.
+    """
+    require_x64("a prediction")
+    path = Path(folder) / CORRECTED
+    document = files.read_json(path)
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+        raise InputError(f"{path}: is no corrected model; --diagnosis needs a folder that `diagnose` wrote")
+    corrected = Corrected.from_json(document)
+    recording = motion if isinstance(motion, Recording) else load(motion)
+    recording.require_dof(corrected.arm.dof)
+    trace = prepare(recording, corrected.arm, whole=True, noise=np.asarray(document["torque_noise"]))
+    sign = held_sign(corrected.arm, trace.motion.qd, trace.motion.qdd)
+    tau = corrected.measured_torque(trace.motion, trace.channels, sign)
+    return scipy.interpolate.interp1d(
+        trace.motion.time, tau, axis=0, fill_value="extrapolate", assume_sorted=True
+    )(recording.time)

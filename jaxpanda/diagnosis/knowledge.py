@@ -1,0 +1,86 @@
+r"""How well the numbers in the user's model are known, as columns with a prior: what is no physics to report.
+
+The nuisance is $\tau_0 = N\,x$ with $x \sim N(0, 1)$. Its columns are scaled by the uncertainty, so that
+"exact" leaves none and "unknown" leaves everything free.
+
+- `exact`: the inertial parameters and known friction are those of the arm.
+- `identified`: they were identified from a motion much like those recorded: a covariance
+  $\sigma^2 (W^\top W)^{-1}$ of an identification motion, far below the noise in torque, whatever the parameters.
+- `rough`: masses to 4 %, centres of mass to 3 mm, inertias to 10 %, friction to 20 %.
+- `unknown`: flat.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from ..arm import Arm
+from ..errors import InputError
+from ..parameters import random_regressor
+from .traces import Trace, held_sign
+
+Knowledge = Literal["exact", "identified", "rough", "unknown"]
+
+_SAMPLES = 1500
+"""Samples, taken as independent, of the identification that "identified" supposes."""
+_FRICTION = {"exact": 0.0, "identified": 0.02, "rough": 0.2, "unknown": 10.0}
+_UNKNOWN = 1e3
+"""Deviation, in those of an identification, that passes for unknown."""
+
+
+def check(knowledge: str) -> None:
+    """Refuse a word that is none."""
+    if knowledge not in get_args(Knowledge):
+        raise InputError(f"unknown knowledge {knowledge!r}; there are {', '.join(get_args(Knowledge))}")
+
+
+def inertial_spread(
+    arm: Arm, knowledge: Knowledge, noise: Float[np.ndarray, " dof"]
+) -> Float[np.ndarray, "standard n"]:
+    """Square root L of the covariance $LL^\\top$ of the standard parameters."""
+    if knowledge == "exact":
+        return np.zeros((10 * arm.dof, 0))
+    if knowledge == "rough":
+        return _rough(arm)
+    W = np.asarray(random_regressor(arm, _SAMPLES)).reshape(_SAMPLES, arm.dof, -1) / noise[:, None]
+    _, s, Vt = np.linalg.svd(W.reshape(-1, 10 * arm.dof), full_matrices=False)
+    felt = s > 1e-8 * s[0]
+    return Vt[felt].T / s[felt] * (1.0 if knowledge == "identified" else _UNKNOWN)
+
+
+def _rough(arm: Arm) -> Float[np.ndarray, "standard n"]:
+    standard = np.asarray(arm.standard)
+    columns = []
+    for link, phi in enumerate(standard):
+        mass = max(abs(phi[0]), 0.1)
+        block = np.zeros((10, 10))
+        block[:, 0] = 0.04 * phi
+        block[1:4, 1:4] = 0.003 * mass * np.eye(3)
+        block[4:, 4:] = 0.1 * max(np.abs(phi[[4, 6, 9]]).max(), 1e-4) * np.eye(6)
+        wide = np.zeros((standard.size, 10))
+        wide[10 * link : 10 * link + 10] = block
+        columns.append(wide)
+    return np.concatenate(columns, 1)
+
+
+def nuisance(
+    traces: Sequence[Trace], spread: Float[np.ndarray, "standard n"], knowledge: Knowledge
+) -> list[Float[np.ndarray, "time dof columns"]]:
+    """The columns N of each recording."""
+    arm = traces[0].motion.arm
+    share = _FRICTION[knowledge]
+    damping, level = share * np.asarray(arm.damping), share * np.asarray(arm.frictionloss)
+    out = []
+    for trace in traces:
+        parts = [trace.motion.regressor @ spread]
+        joints = np.eye(arm.dof)
+        for j in np.flatnonzero(damping > 0):
+            parts.append((damping[j] * trace.motion.qd)[:, :, None] * joints[:, j : j + 1])
+        c = trace.channels
+        sign = trace.down(held_sign(arm, np.asarray(c.qd), np.asarray(c.qdd)))
+        for j in np.flatnonzero(level > 0):
+            parts.append((level[j] * sign)[:, :, None] * joints[:, j : j + 1])
+        out.append(np.concatenate(parts, 2))
+    return out

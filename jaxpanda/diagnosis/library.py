@@ -1,0 +1,76 @@
+"""Every shape of every effect as columns on the coarse grid of each recording."""
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ..effects import CATALOGUE, AbstractArmEffect, AbstractEffect, AbstractJointEffect, joint_columns
+from .traces import Trace
+
+_BATCH = 16
+"""Shapes that one compiled call takes, for the grid and for refinement alike."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidates:
+    """Shapes of one form of an effect at one joint (or in the whole arm), with their columns.
+
+    `columns` holds for each recording `(time, m, n)` where the effect acts in one joint, else
+    `(time, dof, m, n)`.
+    """
+
+    effects: tuple[AbstractEffect, ...]
+    joint: int | None
+    columns: tuple[np.ndarray, ...]
+
+    @property
+    def name(self) -> str:
+        return self.effects[0].name
+
+
+def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndarray, "time ..."]:
+    """Columns of shapes of one class and form: `(time, m, n)` in one joint, `(time, dof, m, n)` in the arm."""
+    if isinstance(effects[0], AbstractJointEffect):
+        parts = []
+        for start in range(0, len(effects), _BATCH):
+            batch = list(effects[start : start + _BATCH])
+            filled = batch + [batch[-1]] * (_BATCH - len(batch))
+            parts.append(joint_columns(filled, trace.channels, trace.dt)[: len(batch)])
+        return trace.down(np.moveaxis(np.concatenate(parts), 0, 1))
+    return np.stack(
+        [effect.over(trace.motion) for effect in effects if isinstance(effect, AbstractArmEffect)], 2
+    )
+
+
+def form_of(effect: AbstractEffect) -> tuple[str, str]:
+    """What must agree for shapes to be evaluated together."""
+    return type(effect).__name__, str(getattr(effect, "form", ""))
+
+
+def build(traces: Sequence[Trace]) -> list[Candidates]:
+    """The catalogue's grids on these recordings."""
+    arm = traces[0].motion.arm
+    out = []
+    for effect_class in CATALOGUE:
+        groups: dict[tuple, list[AbstractEffect]] = defaultdict(list)
+        for effect in effect_class.grid(arm):
+            groups[form_of(effect)].append(effect)
+        for effects in groups.values():
+            out += _by_joint(effects, [columns_of(effects, trace) for trace in traces])
+    return out
+
+
+def _by_joint(effects: Sequence[AbstractEffect], columns: Sequence[np.ndarray]) -> list[Candidates]:
+    places: dict[tuple, list[int]] = defaultdict(list)
+    for i, effect in enumerate(effects):
+        places[effect.joints].append(i)
+    local = isinstance(effects[0], AbstractJointEffect)
+    return [
+        Candidates(
+            tuple(effects[i] for i in at), joints[0] if local else None, tuple(c[..., at, :] for c in columns)
+        )
+        for joints, at in places.items()
+    ]

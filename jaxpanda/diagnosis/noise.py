@@ -1,0 +1,85 @@
+"""Noise of each joint's torque, from what a model with everything in it leaves.
+
+The noise must not be read off the residual of the nominal model: what is slow in a missing effect would pass for
+correlated noise, and hide it. A saturated fit (rigid body with free parameters, smooth functions of position,
+velocity, load and time) takes any effect away first, as well as it can, at the price of its degrees of freedom.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from .evidence import Noise
+from .traces import Trace
+
+ORDER = 3
+
+
+def hats(x: Float[np.ndarray, " time"], count: int) -> Float[np.ndarray, "time count"]:
+    """Piecewise linear functions on knots at equally many samples each; they add up to 1."""
+    knots = np.unique(np.quantile(x, np.linspace(0, 1, count)))
+    if len(knots) < 3:
+        return np.ones((len(x), 1))
+    return np.stack([np.interp(x, knots, e) for e in np.eye(len(knots))], 1)
+
+
+def saturated_residual(
+    traces: Sequence[Trace],
+    residual: Sequence[Float[np.ndarray, "time dof"]],
+    joint: int,
+    extra: Sequence[Float[np.ndarray, "time n"]],
+) -> tuple[list[Float[np.ndarray, " time"]], int]:
+    """What the saturated model leaves in a joint of each recording, and its degrees of freedom."""
+
+    def stacked(part):
+        return np.concatenate([part(trace) for trace in traces])
+
+    Y = stacked(lambda t: t.motion.regressor[:, joint])
+    Q, R, _ = scipy.linalg.qr(Y, mode="economic", pivoting=True)
+    rank = int(np.sum(np.abs(np.diag(R)) > 1e-6 * max(abs(R[0, 0]), 1e-12)))
+    q, qd = stacked(lambda t: t.motion.q[:, joint]), stacked(lambda t: t.motion.qd[:, joint])
+    load = stacked(lambda t: t.motion.load[:, joint])
+    sign = stacked(lambda t: t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / 0.01)))
+    speed = hats(np.abs(qd), 8)
+    clock = scipy.linalg.block_diag(*[hats(t.motion.time, 10) for t in traces])
+    A = np.concatenate(
+        [Q[:, :rank], hats(q, 10), speed, sign[:, None] * speed, sign[:, None] * hats(q, 4), hats(load, 5),
+         sign[:, None] * hats(load, 3), clock, sign[:, None] * clock[:, ::2], *([np.concatenate(list(extra))] if extra else [])],
+        1,
+    )  # fmt: skip
+    w = np.concatenate([t.weight for t in traces])
+    U, s, _ = np.linalg.svd(A * w[:, None], full_matrices=False)
+    U = U[:, s > 1e-6 * s[0]]
+    r = stacked_residual = np.concatenate([x[:, joint] for x in residual]) * w
+    left = stacked_residual - U @ (U.T @ r)
+    return np.split(left, np.cumsum([t.motion.samples for t in traces])[:-1]), U.shape[1]
+
+
+def estimate(
+    traces: Sequence[Trace],
+    residual: Sequence[Float[np.ndarray, "time dof"]],
+    extra: Sequence[Sequence[Float[np.ndarray, "time n"]]],
+) -> Noise:
+    """Autoregressive noise of order 3; `extra` holds, for each joint, accepted columns in each recording."""
+    dof = traces[0].motion.dof
+    a, sigma, std = np.zeros((dof, ORDER)), np.zeros(dof), np.zeros(dof)
+    for j in range(dof):
+        parts, used = saturated_residual(traces, residual, j, extra[j])
+        a[j], sigma[j], std[j] = autoregression(parts, used)
+    return Noise(a, sigma, std)
+
+
+def autoregression(parts: Sequence[Float[np.ndarray, " time"]], used: int) -> tuple[np.ndarray, float, float]:
+    """Coefficients, deviation of the innovations, and deviation of the noise, by least squares."""
+    past = np.concatenate(
+        [np.stack([p[ORDER - 1 - k : len(p) - 1 - k] for k in range(ORDER)], 1) for p in parts]
+    )
+    now = np.concatenate([p[ORDER:] for p in parts])
+    ridge = 1e-6 * max(float(now @ now), 1e-12) * np.eye(ORDER)
+    a = np.linalg.solve(past.T @ past + ridge, past.T @ now)
+    innovation = now - past @ a
+    freedom = max(len(now) - used - ORDER, len(now) // 4)
+    sigma = float(np.sqrt(innovation @ innovation / freedom))
+    return a, max(sigma, 1e-9), float(np.sqrt(now @ now / freedom))

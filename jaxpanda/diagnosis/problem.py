@@ -1,0 +1,116 @@
+"""What a diagnosis works on, and the model it has arrived at so far."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ..effects import AbstractArmEffect, AbstractEffect, AbstractJointEffect
+from .evidence import Design, Noise
+from .library import Candidates, build, columns_of
+from .noise import estimate
+from .traces import Trace
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+    """An effect taken into the model: its columns in each recording, and the prior of its coefficients."""
+
+    effect: AbstractEffect
+    columns: tuple[Float[np.ndarray, "time dof n"], ...]
+    deviation: Float[np.ndarray, " n"]
+
+    @property
+    def key(self) -> tuple[str, tuple[int, ...]]:
+        """Name and joints: what makes two terms the same finding."""
+        return self.effect.name, self.effect.joints
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """Recordings, what the nominal model leaves of them, and what is no physics to report."""
+
+    traces: tuple[Trace, ...]
+    active: tuple[bool, ...]
+    """Whether effects may act in a recording; not in those of reference."""
+    nuisance: tuple[Float[np.ndarray, "time dof n"], ...]
+
+    @property
+    def dof(self) -> int:
+        return self.traces[0].motion.dof
+
+    @functools.cached_property
+    def residual(self) -> list[Float[np.ndarray, "time dof"]]:
+        """Measured less nominal torque [N m]."""
+        return [trace.residual for trace in self.traces]
+
+    @functools.cached_property
+    def library(self) -> list[Candidates]:
+        """The catalogue on these recordings; zero in those of reference."""
+        out = []
+        for c in build(self.traces):
+            columns = tuple(
+                x if on else np.zeros_like(x) for x, on in zip(c.columns, self.active, strict=True)
+            )
+            out.append(dataclasses.replace(c, columns=columns))
+        return out
+
+    def term(self, effect: AbstractEffect, deviation: Float[np.ndarray, " n"]) -> Term:
+        """The effect's columns in all recordings."""
+        return Term(effect, tuple(self.full_columns([effect])), deviation)
+
+    def full_columns(self, effects: Sequence[AbstractEffect]) -> list[Float[np.ndarray, "time dof n"]]:
+        """Columns of one effect, at all joints."""
+        out = []
+        for trace, on in zip(self.traces, self.active, strict=True):
+            n = len(effects[0].coefficients)
+            wide = np.zeros((trace.motion.samples, self.dof, n))
+            if on and acts_in(effects[0], trace):
+                if isinstance(effects[0], AbstractJointEffect):
+                    wide[:, effects[0].joints[0]] = columns_of(effects, trace)[:, 0]
+                else:
+                    wide = columns_of(effects, trace)[:, :, 0]
+            out.append(wide)
+        return out
+
+    def whitened(self, columns: Sequence[np.ndarray], noise: Noise, joint: int) -> np.ndarray:
+        """Rows of a joint in all recordings, one below the other, with unit noise."""
+        parts = []
+        for trace, x in zip(self.traces, columns, strict=True):
+            w = trace.weight.reshape(-1, *[1] * (x.ndim - 1))
+            parts.append(noise.whiten(x, joint) * w)
+        return np.concatenate(parts)
+
+    def design(self, terms: Sequence[Term], noise: Noise) -> Design:
+        """The model with these terms, whitened."""
+        columns = [
+            np.concatenate([n, *(t.columns[r] for t in terms)], 2) for r, n in enumerate(self.nuisance)
+        ]
+        precision = np.concatenate([np.ones(self.nuisance[0].shape[2]), *(t.deviation**-2.0 for t in terms)])
+        return Design(
+            [self.whitened([c[:, j] for c in columns], noise, j) for j in range(self.dof)],
+            [self.whitened([r[:, j] for r in self.residual], noise, j) for j in range(self.dof)],
+            precision,
+        )
+
+    def noise(self, terms: Sequence[Term]) -> Noise:
+        """Noise that a saturated model with these terms leaves."""
+        extra = []
+        for j in range(self.dof):
+            here = [t for t in terms if any(np.any(c[:, j]) for c in t.columns)]
+            extra.append(
+                [np.concatenate([t.columns[r][:, j] for t in here], 1) for r in range(len(self.traces))]
+                if here
+                else []
+            )
+        return estimate(self.traces, self.residual, extra)
+
+
+def acts_in(effect: AbstractEffect, trace: Trace) -> bool:
+    """Whether an effect is of this recording."""
+    return getattr(effect, "recording", trace.name) == trace.name
+
+
+__all__ = ["AbstractArmEffect", "Problem", "Term", "acts_in"]

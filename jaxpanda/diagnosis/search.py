@@ -1,0 +1,249 @@
+"""Which effects, where, in which shape: greedy selection by evidence, everything refitted at every step."""
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.special
+from jaxtyping import Float
+
+from ..effects import AbstractEffect, AbstractJointEffect
+from .events import Proposal, ripple, windows
+from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
+from .library import columns_of
+from .problem import Problem, Term, acts_in
+
+ACCEPT = 9.0
+"""Evidence that an effect needs, its search over shapes paid for [nats]."""
+SWAP = 3.0
+"""Evidence that another effect must win by to take an accepted one's place [nats]."""
+MOST_TERMS = 8
+_REFINED = 8
+_ROUNDS = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """Accepted terms, the noise beside them, and what every rival would bring now."""
+
+    terms: tuple[Term, ...]
+    noise: Noise
+    design: Design
+
+
+def start(problem: Problem) -> State:
+    """Nothing accepted yet."""
+    return with_terms(problem, ())
+
+
+def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
+    """The model with these terms, its noise estimated anew."""
+    noise = problem.noise(terms)
+    return State(tuple(terms), noise, problem.design(terms, noise))
+
+
+def search(problem: Problem, log: list[str] | None = None) -> State:
+    """Add the likeliest effect while one has evidence; then see if another does better in an earlier one's place."""
+    say = log.append if log is not None else (lambda _: None)
+    state = start(problem)
+    while len(state.terms) < MOST_TERMS:
+        proposals = ranked(problem, state.design, state.noise)
+        say(f"{len(state.terms)} terms: " + describe(proposals[:6]))
+        if not proposals or proposals[0].evidence < ACCEPT:
+            break
+        state = with_terms(problem, (*state.terms, problem.term(proposals[0].effect, proposals[0].deviation)))
+        state = swap(problem, state, say)
+    return prune(problem, state, say)
+
+
+def swap(problem: Problem, state: State, say: Any) -> State:
+    """Take out each term in turn, and put in what then has most evidence."""
+    for i in range(len(state.terms) if len(state.terms) > 1 else 0):
+        others = (*state.terms[:i], *state.terms[i + 1 :])
+        design = problem.design(others, state.noise)
+        proposals = ranked(problem, design, state.noise)
+        held = next((p.evidence for p in proposals if p.key == state.terms[i].key), -np.inf)
+        best = proposals[0]
+        if best.key == state.terms[i].key or best.evidence > held + SWAP:
+            if best.key != state.terms[i].key:
+                say(f"swap {state.terms[i].key} for " + describe([best]))
+            terms = list(state.terms)
+            terms[i] = problem.term(best.effect, best.deviation)
+            if len({t.key for t in terms}) < len(terms):
+                terms = [t for k, t in enumerate(terms) if k == i or t.key != best.key]
+                return with_terms(problem, terms)
+            state = with_terms(problem, terms)
+    return state
+
+
+def prune(problem: Problem, state: State, say: Any) -> State:
+    """Drop terms that the others have made needless, the weakest first."""
+    while state.terms:
+        gains = [gain(problem, state, i) for i in range(len(state.terms))]
+        weakest = int(np.argmin(gains))
+        floor = max(ACCEPT, 0.01 * max(gains))
+        if gains[weakest] >= floor:
+            break
+        say(f"prune {state.terms[weakest].key}: {gains[weakest]:.1f}")
+        state = with_terms(problem, (*state.terms[:weakest], *state.terms[weakest + 1 :]))
+    return state
+
+
+def gain(problem: Problem, state: State, i: int) -> float:
+    """Evidence of a term beside the others [nats]."""
+    others = (*state.terms[:i], *state.terms[i + 1 :])
+    return state.design.log_evidence - problem.design(others, state.noise).log_evidence
+
+
+def describe(proposals: Sequence[Proposal]) -> str:
+    """For the log."""
+    return "; ".join(f"{p.key[0]}{[j + 1 for j in p.key[1]]} {p.evidence:.1f}" for p in proposals)
+
+
+def ranked(problem: Problem, design: Design, noise: Noise) -> list[Proposal]:
+    """What each effect at each place would bring, the best of them refined; most evidence first."""
+    proposals = [
+        *grids(problem, design, noise),
+        *ripple(problem, design, noise),
+        *windows(problem, design, noise),
+    ]
+    best: dict[tuple, Proposal] = {}
+    for p in proposals:
+        if p.key not in best or p.evidence > best[p.key].evidence:
+            best[p.key] = p
+    order = sorted(best.values(), key=lambda p: -p.evidence)
+    refined = [refine(problem, design, noise, p) for p in order[:_REFINED]]
+    return sorted([*refined, *order[_REFINED:]], key=lambda p: -p.evidence)
+
+
+def grids(problem: Problem, design: Design, noise: Noise) -> list[Proposal]:
+    """The catalogue's grids: for each effect and place, the likeliest shape and the evidence over all."""
+    scores: dict[tuple, list] = defaultdict(list)
+    for group in problem.library:
+        coefficients = group.effects[0].coefficients
+        signs = np.array([k.sign for k in coefficients])
+        if group.joint is not None:
+            j = group.joint
+            Phi = problem.whitened(group.columns, noise, j)
+            b, G = design.in_joint(j, Phi)
+            deviation = _deviation(coefficients, np.concatenate(group.columns), noise.std[j])
+        else:
+            parts = [
+                design.in_arm(
+                    [
+                        problem.whitened([c[:, j, m] for c in group.columns], noise, j)
+                        for j in range(problem.dof)
+                    ]
+                )
+                for m in range(len(group.effects))
+            ]
+            b, G = np.stack([p[0] for p in parts]), np.stack([p[1] for p in parts])
+            deviation = _deviation(
+                coefficients, np.concatenate(group.columns) / noise.std[:, None, None], 1.0
+            )
+        score, scale = log_bayes(b, G, deviation, _scales(coefficients), signs)
+        scores[group.name, group.effects[0].joints].append((group, score, scale, deviation))
+    out = []
+    for parts in scores.values():
+        everything = np.concatenate([score for _, score, _, _ in parts])
+        group, score, scale, deviation = max(parts, key=lambda part: part[1].max())
+        top = int(score.argmax())
+        out.append(
+            Proposal(
+                group.effects[top],
+                float(scipy.special.logsumexp(everything) - np.log(len(everything))),
+                float(score[top]),
+                deviation[top] * scale[top],
+                tuple(0.3 if s.logarithmic else 0.002 for s in group.effects[top].shapes),
+            )
+        )
+    return out
+
+
+def _scales(coefficients) -> tuple[float, ...]:
+    return SCALES if coefficients[0].scale is None else PHYSICAL_SCALES
+
+
+def _deviation(coefficients, columns: np.ndarray, unit: float) -> Float[np.ndarray, "m n"]:
+    """Prior deviation of each coefficient: its plausible size, or that of an effect as large as the noise.
+
+    Args:
+        coefficients: of the effect.
+        columns: `(time, m, n)`, or `(time, dof, m, n)` over the noise; the joint that feels most counts.
+        unit: noise of the joint.
+    """
+    size = np.sqrt((columns**2).mean(0))
+    if size.ndim == 3:
+        size = size.max(0)
+    deviation = unit / np.maximum(size, 1e-9 * max(float(size.max()), 1e-12))
+    for k, coefficient in enumerate(coefficients):
+        if coefficient.scale is not None:
+            deviation[:, k] = coefficient.scale
+    return deviation
+
+
+def score(
+    problem: Problem, design: Design, noise: Noise, effects: Sequence[AbstractEffect]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
+    """Evidence of single shapes of one form at one place, and their prior deviations."""
+    coefficients = effects[0].coefficients
+    signs = np.array([k.sign for k in coefficients])
+    columns = []
+    for trace, on in zip(problem.traces, problem.active, strict=True):
+        x = columns_of(effects, trace)
+        columns.append(x if on and acts_in(effects[0], trace) else np.zeros_like(x))
+    if isinstance(effects[0], AbstractJointEffect):
+        j = effects[0].joints[0]
+        b, G = design.in_joint(j, problem.whitened(columns, noise, j))
+        deviation = _deviation(coefficients, np.concatenate(columns), noise.std[j])
+    else:
+        parts = [
+            design.in_arm(
+                [problem.whitened([c[:, j, m] for c in columns], noise, j) for j in range(problem.dof)]
+            )
+            for m in range(len(effects))
+        ]
+        b, G = np.stack([p[0] for p in parts]), np.stack([p[1] for p in parts])
+        deviation = _deviation(coefficients, np.concatenate(columns) / noise.std[:, None, None], 1.0)
+    value, scale = log_bayes(b, G, deviation, _scales(coefficients), signs)
+    return value, deviation * scale[:, None]
+
+
+def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> Proposal:
+    """Move the shape to where the evidence is highest, by a pattern search whose every round is one batch."""
+    shapes = proposal.effect.shapes
+    if not shapes:
+        return proposal
+    effect, steps = proposal.effect, np.array(proposal.steps[: len(shapes)])
+    best, deviation = score(problem, design, noise, [effect])
+    best, deviation = float(best[0]), deviation[0]
+    for _ in range(_ROUNDS if len(shapes) == 1 else _ROUNDS + 3):
+        moves = [m * e for e in np.diag(steps) for m in (-1.0, 1.0, -0.4, 0.4)]
+        if len(shapes) > 1:
+            moves += [np.array([a, b]) * steps[:2] for a in (-1, 1) for b in (-1, 1)]
+        tried = [moved(effect, move) for move in moves]
+        values, deviations = score(problem, design, noise, tried)
+        top = int(values.argmax())
+        if values[top] > best:
+            gained = values[top] - best
+            effect, best, deviation = tried[top], float(values[top]), deviations[top]
+            if gained < 0.05:
+                break
+        else:
+            steps = steps * 0.35
+    gained = best - proposal.best
+    return dataclasses.replace(
+        proposal, effect=effect, best=best, deviation=deviation, evidence=proposal.evidence + gained
+    )
+
+
+def moved(effect: AbstractEffect, move: Float[np.ndarray, " shapes"]) -> AbstractEffect:
+    """The effect with its shape parameters moved, within their bounds."""
+    changes = {}
+    for shape, step in zip(effect.shapes, move, strict=False):
+        value = float(getattr(effect, shape.name))
+        value = value * np.exp(step) if shape.logarithmic else value + step
+        changes[shape.name] = float(np.clip(value, shape.lower, shape.upper))
+    return dataclasses.replace(effect, **changes)

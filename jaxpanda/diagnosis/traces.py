@@ -1,0 +1,150 @@
+"""Recordings made ready for diagnosis: one fine grid for physics with corners, one coarse grid for statistics.
+
+What is nonlinear in velocity, has memory or high order is evaluated on the fine grid and low-passed exactly like
+the torque; what is smooth is evaluated on the coarse grid. The coarse grid's rate is two to two and a half times
+the cutoff of the torque: an autoregressive noise model on samples closer than that would undo the filter.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.interpolate
+from jaxpanda_kernels import mass_matrix
+from jaxtyping import Float
+
+from .. import signals as signals_
+from ..arm import Arm
+from ..effects import Channels, Motion
+from ..recordings import Recording
+
+WORK_RATE = 100.0
+"""Rate of the coarse grid, at most [Hz]."""
+FINE_RATE = 1000.0
+"""Rate of the fine grid, at most [Hz]."""
+POSITION_CUTOFF = 12.0
+"""Low-pass of q before it is differentiated, at most [Hz]."""
+_LEAST_CUTOFF = 5.0
+_TRIM = 0.4
+_SOLREF, _IMPEDANCE_LEAST, _IMPEDANCE_MOST = 0.02, 0.9, 0.95
+"""MuJoCo's defaults for the constraint that frictionloss is: time constant [s], impedance at rest and beyond."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trace:
+    """One recording: channels on the fine grid, motion, torque and nominal residual on the coarse one."""
+
+    name: str
+    signals: signals_.Signals
+    channels: Channels
+    """On the fine grid."""
+    dt: float
+    """Step of the fine grid [s]."""
+    motion: Motion
+    """On the coarse grid."""
+    tau: Float[np.ndarray, "time dof"] | None
+    """Measured torque, low-passed [N m]."""
+    weight: Float[np.ndarray, " time"]
+    """0 where the coarse grid lies in a gap of the recording, else 1."""
+    keep: np.ndarray
+    """The coarse grid as indices into the fine one."""
+    cutoff: float
+    """Of the low-pass of torque and columns [Hz]."""
+
+    @property
+    def residual(self) -> Float[np.ndarray, "time dof"]:
+        """Measured less nominal torque [N m]."""
+        assert self.tau is not None
+        return self.tau - self.motion.torque
+
+    def down(self, fine: Float[np.ndarray, "time ..."]) -> Float[np.ndarray, "kept ..."]:
+        """From the fine grid to the coarse one, filtered like the torque."""
+        if len(self.keep) == len(fine):
+            return fine
+        return signals_.zero_phase(fine, self.cutoff, 1 / self.dt)[self.keep]
+
+
+def prepare(
+    recording: Recording, arm: Arm, *, whole: bool = False, noise: Float[np.ndarray, " dof"] | None = None
+) -> Trace:
+    """A recording on its two grids.
+
+    Args:
+        recording: with torque, or a motion.
+        arm: whose nominal torque is to be compared.
+        whole: one grid for all, ends and gaps included, as prediction needs.
+        noise: of the torque [N m], where the recording does not tell.
+    """
+    rough = signals_.prepare(recording, cutoff=3.0, rate=WORK_RATE, trim=0.0 if whole else _TRIM)
+    rate, time = rough.rate, rough.time
+    position = scipy.interpolate.CubicSpline(recording.time, recording.q)(
+        np.clip(time, *recording.time[[0, -1]])
+    )
+    if noise is None and rough.tau is not None:
+        noise = signals_.white_noise(rough.tau)
+    q, qd, qdd = signals_.derivatives(position, position_cutoff(position, noise, arm, rate), rate)
+
+    thinnest = max(1, int(rate / FINE_RATE + 1e-6))
+    keep = np.arange(0, len(time), thinnest) if whole else rough.keep
+    stride = int(np.min(np.diff(keep)))
+    thin = next(k for k in range(min(stride, thinnest), 0, -1) if stride % k == 0)
+    fine = np.arange(keep[0] % thin, len(time), thin)
+    kept, dt = (keep - fine[0]) // thin, thin / rate
+    cutoff = min(0.4 * rate / stride, 0.45 * rate)
+
+    sign = held_sign(arm, qd[fine], qdd[fine])
+    held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
+    held, tau = held_fine[kept], None if rough.tau is None else rough.tau[keep]
+    if stride > thin:
+        held = signals_.zero_phase(held_fine, cutoff, 1 / dt)[kept]
+    if stride > 1 and rough.tau is not None:
+        tau = signals_.zero_phase(rough.tau, cutoff, rate)[keep]
+    motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], held)
+    load = motion.load
+    if stride > thin:
+        load = scipy.interpolate.CubicSpline(motion.time, load)(np.clip(time[fine], *motion.time[[0, -1]]))
+    channels = Channels(time[fine], q[fine], qd[fine], qdd[fine], load, load + held_fine)
+    weight = (_distance(recording.time, time[keep]) < 2.5 / rate).astype(float)
+    return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff)
+
+
+def _distance(
+    rows: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " time"]
+) -> Float[np.ndarray, " time"]:
+    """From each point of the grid to the nearest row [s]."""
+    after = np.clip(np.searchsorted(rows, grid), 1, len(rows) - 1)
+    return np.minimum(np.abs(rows[after] - grid), np.abs(grid - rows[after - 1]))
+
+
+def held_sign(
+    arm: Arm, qd: Float[np.ndarray, "time dof"], qdd: Float[np.ndarray, "time dof"]
+) -> Float[np.ndarray, "time dof"]:
+    r"""Share of its frictionloss at which each joint's friction stands in MuJoCo, -1 to 1.
+
+    A soft constraint holds the joint: $f = \mathrm{clip}(D\,(\ddot q + b\,\dot q), \pm F_c)$ with
+    $b = 2/(d_{max} T)$ and $D = \frac{d_0}{1 - d_0} / (M^{-1})_{jj}$ at the reference pose; on a light joint that
+    is far from a sign of the velocity.
+    """
+    level = np.asarray(arm.frictionloss)
+    rest = jnp.zeros(arm.dof)
+    M = np.asarray(mass_matrix(arm.chain, arm.standard, rest)) + np.diag(np.asarray(arm.armature))
+    stiffness = _IMPEDANCE_LEAST / (1 - _IMPEDANCE_LEAST) / np.maximum(np.diag(np.linalg.inv(M)), 1e-9)
+    force = stiffness * (qdd + 2 / (_IMPEDANCE_MOST * _SOLREF) * qd)
+    return np.clip(force / np.where(level > 0, level, 1.0), -1.0, 1.0)
+
+
+def position_cutoff(
+    q: Float[np.ndarray, "time dof"], noise: Float[np.ndarray, " dof"] | None, arm: Arm, rate: float
+) -> float:
+    r"""Where the noise of q, differentiated twice and times the inertia, reaches the noise of the torque [Hz].
+
+    $M\,(2\pi f)^2\,\sigma_q = \sigma_\tau$ for the joint where that happens first; without noise, the most.
+    """
+    most = min(POSITION_CUTOFF, 0.25 * rate)
+    if noise is None:
+        return most
+    M = np.diag(np.asarray(mass_matrix(arm.chain, arm.standard, jnp.asarray(q.mean(0))))) + np.asarray(
+        arm.armature
+    )
+    crossing = np.sqrt(noise / np.maximum(np.abs(M) * signals_.white_noise(q), 1e-12)) / (2 * np.pi)
+    return float(np.clip(1.3 * crossing.min(), min(_LEAST_CUTOFF, most), most))

@@ -1,0 +1,22 @@
+"""The catalogue of physics beyond rigid bodies: one class an effect, one file a family."""
+
+from . import contact, drive, friction, load, memory, sensing
+from .effect import AbstractArmEffect as AbstractArmEffect
+from .effect import AbstractEffect as AbstractEffect
+from .effect import AbstractInstantEffect as AbstractInstantEffect
+from .effect import AbstractJointEffect as AbstractJointEffect
+from .effect import AbstractMemoryEffect as AbstractMemoryEffect
+from .effect import Coefficient as Coefficient
+from .effect import Shape as Shape
+from .effect import joint_columns as joint_columns
+from .motion import Channels as Channels
+from .motion import Motion as Motion
+
+CATALOGUE = (
+    *friction.EFFECTS,
+    *memory.EFFECTS,
+    *drive.EFFECTS,
+    *load.EFFECTS,
+    *sensing.EFFECTS,
+    *contact.EFFECTS,
+)

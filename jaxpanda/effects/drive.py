@@ -1,0 +1,240 @@
+"""What the drive train adds: rotor inertia, ripple, springs, compliance, backlash."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..arm import Arm
+from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape
+from .motion import Channels, Joint, Motion
+
+
+class Armature(AbstractInstantEffect):
+    r"""Reflected inertia of the rotor, $\tau_j = I_a\,\ddot q_j$.
+
+    References:
+        Gautier and Khalil 1990.
+    """
+
+    name: ClassVar[str] = "armature"
+    reveals: ClassVar[str] = "high accelerations in several poses of the joints beyond"
+    confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "joint_spring")
+
+    joint: Joint
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["Armature"]:
+        return [cls(j) for j in range(arm.dof)]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("armature", "kg·m²", sign=1),)
+
+    @property
+    def equation(self) -> str:
+        return "tau = armature * ddq"
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        return s.qdd[self.joint][None]
+
+    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+        return {"armature": {int(self.joint): c[0]}}
+
+
+class JointSpring(AbstractInstantEffect):
+    r"""Torque that depends on joint position: a cable, a hose, a balancing spring.
+
+    $$\tau_j = k\,q_j + b, \qquad \text{at rest at } q_0 = -b/k$$
+
+    Form "cubic" adds $k_3 q^3$, "stop" is a spring that acts on one side only, from `q0` on.
+    """
+
+    name: ClassVar[str] = "joint_spring"
+    reveals: ClassVar[str] = "the joint's full range at rest, in different poses of the arm"
+    confounded_with: ClassVar[tuple[str, ...]] = ("torque_offset", "inertial_parameters", "encoder_offset")
+
+    joint: Joint
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["JointSpring"]:
+        return [cls(j, form) for form in ("linear", "centred", "cubic") for j in range(arm.dof)]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        k, b = Coefficient("stiffness", "N·m/rad", sign=1), Coefficient("torque_at_zero", "N·m")
+        return {"linear": (k, b), "centred": (k,), "cubic": (k, b, Coefficient("cubic", "N·m/rad³"))}[
+            self.form
+        ]
+
+    @property
+    def equation(self) -> str:
+        return (
+            "tau = "
+            + {
+                "linear": "stiffness * q + torque_at_zero",
+                "centred": "stiffness * q",
+                "cubic": "stiffness * q + torque_at_zero + cubic * q^3",
+            }[self.form]
+        )
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        q = s.q[self.joint]
+        one = jnp.ones_like(q)
+        return jnp.stack({"linear": [q, one], "centred": [q], "cubic": [q, one, q**3]}[self.form])
+
+    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+        if self.form == "cubic" or arm.stiffness[int(self.joint)] != 0:
+            return {}
+        j = int(self.joint)
+        return {"stiffness": {j: c[0]}, "springref": {j: -c[1] / c[0] if self.form == "linear" else 0.0}}
+
+
+class TorqueRipple(AbstractInstantEffect):
+    r"""Torque periodic in the position of the joint or of its motor.
+
+    $$\tau_j = a \sin(n q_j) + b \cos(n q_j)$$
+
+    The order n is per turn of the joint: 2N for the wave generator of a gear of ratio N; the second harmonic is
+    in form "two". `grid` holds no order: the search scans them.
+
+    References:
+        Tuttle, MIT AI-TR 1365, 1992; Taghirad, Bélanger, Helmy 1998.
+    """
+
+    name: ClassVar[str] = "torque_ripple"
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("order", "1/rad", 2.5, 600.0),)
+    reveals: ClassVar[str] = "a sweep of speeds: the frequency moves with it, the order stays"
+    confounded_with: ClassVar[tuple[str, ...]] = ("joint_spring", "inertial_parameters")
+
+    joint: Joint
+    order: Float[Array, ""] | float
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["TorqueRipple"]:
+        return []
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        one = (Coefficient("sine", "N·m"), Coefficient("cosine", "N·m"))
+        two = (Coefficient("sine_2", "N·m"), Coefficient("cosine_2", "N·m"))
+        return one if self.form == "one" else one + two
+
+    @property
+    def equation(self) -> str:
+        one = "tau = sine * sin(order * q) + cosine * cos(order * q)"
+        return (
+            one
+            if self.form == "one"
+            else one + " + sine_2 * sin(2 * order * q) + cosine_2 * cos(2 * order * q)"
+        )
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        angle = self.order * s.q[self.joint]
+        one = [jnp.sin(angle), jnp.cos(angle)]
+        return jnp.stack(one if self.form == "one" else [*one, jnp.sin(2 * angle), jnp.cos(2 * angle)])
+
+
+class JointElasticity(AbstractArmEffect):
+    r"""Compliance between the position sensor and the link.
+
+    $$q_{link} = q_j - \tau_j / K_j, \qquad
+      \Delta\tau = \frac{\partial\tau}{\partial q}\Delta q + \frac{\partial\tau}{\partial \dot q}\Delta\dot q
+        + M\,\Delta\ddot q, \qquad \Delta q = -\tau_j / K_j$$
+
+    to first order in the compliance $1/K$. $\tau_j$ is the nominal torque, smoothed, since its second derivative
+    would otherwise be made of the same noise as the residual.
+
+    References:
+        Spong, ASME JDSMC 1987; Madsen et al., Math. Probl. Eng. 2020.
+    """
+
+    name: ClassVar[str] = "joint_elasticity"
+    reveals: ClassVar[str] = (
+        "heavy and light load in the same pose; bursts of high frequency; both encoders, if any"
+    )
+    confounded_with: ClassVar[tuple[str, ...]] = ("encoder_offset", "time_delay", "backlash")
+
+    joint: Joint
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["JointElasticity"]:
+        return [cls(j) for j in range(arm.dof)]
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return (int(self.joint),)
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("compliance", "rad/(N·m)", sign=1),)
+
+    @property
+    def equation(self) -> str:
+        return "q_link = q - compliance * tau"
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        dq = np.zeros_like(motion.q)
+        dq[:, int(self.joint)] = -motion.load[:, int(self.joint)]
+        return motion.sensitivity(dq)[..., None]
+
+
+class Backlash(AbstractArmEffect):
+    r"""A dead band between motor and link: the link lies on one flank or the other.
+
+    $$q_{link} = q_j - b\,p, \qquad p = \mathrm{clip}(p + \dot q_j\,dt / b, -1, 1)$$
+
+    The torque changes by what the shift of the link costs, to first order in b.
+    """
+
+    name: ClassVar[str] = "backlash"
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("half_width", "rad", 1e-4, 0.05),)
+    reveals: ClassVar[str] = "slow motion through poses where the load changes sign"
+    confounded_with: ClassVar[tuple[str, ...]] = ("presliding_hysteresis", "joint_elasticity")
+
+    joint: Joint
+    half_width: Float[Array, ""] | float
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["Backlash"]:
+        return [
+            cls(j, b, form)
+            for form in ("friction-driven", "load-driven")
+            for b in (5e-4, 2e-3, 8e-3)
+            for j in range(arm.dof)
+        ]
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return (int(self.joint),)
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("lost_motion", "rad", sign=1),)
+
+    @property
+    def equation(self) -> str:
+        return "q_link = q - lost_motion * p, dp = dq * dt / half_width, |p| <= 1"
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        j, b = int(self.joint), float(self.half_width)
+        if self.form == "friction-driven":
+            p = np.empty(motion.samples)
+            state = float(np.tanh(motion.qd[0, j] / 0.01))
+            for i, moved in enumerate(motion.qd[:, j] * motion.dt / b):
+                state = min(1.0, max(-1.0, state + moved))
+                p[i] = state
+        else:
+            p = np.tanh(motion.load[:, j] / (b * 500.0))
+        dq = np.zeros_like(motion.q)
+        dq[:, j] = -p
+        return motion.sensitivity(dq)[..., None]
+
+
+EFFECTS = (Armature, JointSpring, TorqueRipple, JointElasticity, Backlash)

@@ -1,0 +1,188 @@
+r"""The interface of an effect: what the diagnosis, the corrected model and the export need to know of it.
+
+An effect is linear in its `coefficients` once its shape is given:
+
+$$\tau = \sum_k c_k\,\Phi_k(\psi)$$
+
+The coefficients are solved for in closed form; the shape $\psi$ (the float fields of the class) is searched over
+`grid()` and refined. One class holds one effect; a `form` is a variant of it with columns of its own, as in
+Stribeck friction with and without the Coulomb level that the model already holds.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..arm import Arm
+from .motion import Channels, Motion
+
+
+@dataclasses.dataclass(frozen=True)
+class Coefficient:
+    """A linear parameter of an effect: its name, unit, and which signs physics allows."""
+
+    name: str
+    unit: str
+    sign: int = 0
+    """1: not negative; 0: either."""
+    scale: float | None = None
+    """Size that is physically plausible; None: what shows in the noise decides."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """A nonlinear parameter of an effect: its name, unit and bounds."""
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    logarithmic: bool = True
+
+
+class AbstractEffect(eqx.Module):
+    """Physics that a rigid-body model leaves out; the class is one effect, an instance one shape of it."""
+
+    name: ClassVar[str]
+    """Name in the interface's table of effects."""
+    shapes: ClassVar[tuple[Shape, ...]] = ()
+    reveals: ClassVar[str] = ""
+    """The motion that shows the effect, and tells it from what it is confounded with."""
+    confounded_with: ClassVar[tuple[str, ...]] = ()
+    sensor: ClassVar[bool] = False
+    """Whether it changes what is measured, and not how the arm moves."""
+    bound_to_recording: ClassVar[bool] = False
+    """Whether it happened in a recording, and says nothing about another one."""
+
+    @classmethod
+    @abc.abstractmethod
+    def grid(cls, arm: Arm) -> Sequence["AbstractEffect"]:
+        """Shapes and forms to try, for every joint or link it may act at."""
+
+    @property
+    @abc.abstractmethod
+    def joints(self) -> tuple[int, ...]:
+        """0-based joints that the effect is reported at."""
+
+    @property
+    @abc.abstractmethod
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """What the columns are multiplied by, in their order."""
+
+    @property
+    @abc.abstractmethod
+    def equation(self) -> str:
+        """Readable equation in the symbols of the parameters."""
+
+    def parameters(
+        self, c: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]
+    ) -> list[dict[str, Any]]:
+        """Parameters as people know them: name, 1-based joint, value, std, unit."""
+        joint = self.joints[0] + 1 if self.joints else None
+        deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        out = [
+            {"name": k.name, "joint": joint, "value": float(v), "std": float(s), "unit": k.unit}
+            for k, v, s in zip(self.coefficients, c, deviation, strict=True)
+        ]
+        for shape in self.shapes:
+            value = float(getattr(self, shape.name))
+            out.append({"name": shape.name, "joint": joint, "value": value, "std": None, "unit": shape.unit})
+        return out
+
+    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+        """Changes that reproduce the effect in MuJoCo natively, by joint attribute; empty if none can."""
+        return {}
+
+    def to_json(self) -> dict[str, Any]:
+        """Class, shape and form, from which `from_json` makes the effect again."""
+        fields = {f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self)}
+        return {"class": type(self).__name__, **fields}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, str | tuple | list | int | float) or value is None:
+        return value
+    array = np.asarray(value)
+    return array.item() if array.ndim == 0 else array.tolist()
+
+
+class AbstractJointEffect(AbstractEffect):
+    """An effect in the torque of one joint, that depends on channels at one instant or on their past."""
+
+    joint: Any
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return (int(self.joint),)
+
+    @abc.abstractmethod
+    def columns(self, s: Channels, dt: float) -> Float[Array, "time n"]:
+        """Columns over a recording; `dt` is its time step [s]."""
+
+
+class AbstractInstantEffect(AbstractJointEffect):
+    """An effect without memory."""
+
+    @abc.abstractmethod
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        """Columns at one instant."""
+
+    def columns(self, s: Channels, dt: float) -> Float[Array, "time n"]:
+        return jax.vmap(self.at)(s)
+
+
+class AbstractMemoryEffect(AbstractJointEffect):
+    """An effect with a hidden state, stepped through the recording."""
+
+    @abc.abstractmethod
+    def start(self, s: Channels) -> Float[Array, " states"]:
+        """State at the first instant."""
+
+    @abc.abstractmethod
+    def step(
+        self, z: Float[Array, " states"], s: Channels, dt: float
+    ) -> tuple[Float[Array, " states"], Float[Array, " n"]]:
+        """State after an instant, and the columns in it."""
+
+    def columns(self, s: Channels, dt: float) -> Float[Array, "time n"]:
+        first = jax.tree.map(lambda a: a[0], s)
+        return jax.lax.scan(lambda z, now: self.step(z, now, dt), self.start(first), s)[1]
+
+
+class AbstractArmEffect(AbstractEffect):
+    """An effect in several joints at once, smooth in time: evaluated on a whole motion."""
+
+    @abc.abstractmethod
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        """Columns over a motion."""
+
+
+_BUCKET = 2048
+
+
+def joint_columns(
+    effects: Sequence[AbstractJointEffect], channels: Channels, dt: float
+) -> Float[np.ndarray, "effects time n"]:
+    """Columns of many shapes of one form at once; lengths are padded so that recordings share compilations."""
+    samples = channels.t.shape[0]
+    short = -samples % _BUCKET
+    padded = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[-1:], short, 0)]), channels)
+    stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *effects)
+    return np.asarray(_joint_columns(stacked, padded, dt))[:, :samples]
+
+
+@eqx.filter_jit
+def _joint_columns(effects, channels, dt):
+    return jax.vmap(lambda effect: effect.columns(channels, dt))(effects)
+
+
+def smooth_sign(qd: Array, width: Array | float) -> Array:
+    r"""$\tanh(\dot q / v_0)$: the sign of a velocity, for simulators and for velocities that carry noise."""
+    return jnp.tanh(qd / width)

@@ -1,0 +1,337 @@
+"""Friction without memory: of velocity, of load, of time."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..arm import Arm
+from .effect import AbstractInstantEffect, Coefficient, Shape, smooth_sign
+from .motion import Channels, Joint
+
+_WIDTH = Shape("v0", "rad/s", 1e-3, 0.3)
+
+
+class ViscousFriction(AbstractInstantEffect):
+    r"""Friction proportional to velocity, $\tau_j = F_v\,\dot q_j$.
+
+    References:
+        Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 1994.
+    """
+
+    name: ClassVar[str] = "viscous_friction"
+    reveals: ClassVar[str] = "runs at four or more constant speeds, in both directions"
+    confounded_with: ClassVar[tuple[str, ...]] = ("coulomb_friction", "time_delay")
+
+    joint: Joint
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["ViscousFriction"]:
+        return [cls(j) for j in range(arm.dof)]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("damping", "N·m·s/rad", sign=1),)
+
+    @property
+    def equation(self) -> str:
+        return "tau = damping * dq"
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        return s.qd[self.joint][None]
+
+    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+        return {"damping": {int(self.joint): c[0]}}
+
+
+class CoulombFriction(AbstractInstantEffect):
+    r"""Friction of constant magnitude, $\tau_j = F_c \tanh(\dot q_j / v_0)$."""
+
+    name: ClassVar[str] = "coulomb_friction"
+    shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
+    reveals: ClassVar[str] = "reversals, with dwells between them"
+    confounded_with: ClassVar[tuple[str, ...]] = (
+        "presliding_hysteresis",
+        "stribeck_friction",
+        "asymmetric_friction",
+    )
+
+    joint: Joint
+    v0: Float[Array, ""] | float
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["CoulombFriction"]:
+        return [cls(j, v0) for v0 in (0.003, 0.01, 0.03, 0.1) for j in range(arm.dof)]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("coulomb", "N·m", sign=1),)
+
+    @property
+    def equation(self) -> str:
+        return "tau = coulomb * tanh(dq / v0)"
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        return smooth_sign(s.qd[self.joint], self.v0)[None]
+
+    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+        return {"frictionloss": {int(self.joint): c[0]}}
+
+
+class AsymmetricFriction(AbstractInstantEffect):
+    r"""Friction that differs between the directions.
+
+    $$\tau_j = F_c \tanh(\dot q_j / v_0) + \Delta_c \tanh^2(\dot q_j / v_0)
+      \quad\text{or}\quad F_v \dot q_j + \Delta_v |\dot q_j|$$
+
+    Zero at rest, which is what tells it from the offset of a torque sensor. Form "extra" leaves out the
+    symmetric part, for a joint whose model holds it already.
+    """
+
+    name: ClassVar[str] = "asymmetric_friction"
+    shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
+    reveals: ClassVar[str] = "rests of 0.3 s and more, and motion in both directions"
+    confounded_with: ClassVar[tuple[str, ...]] = ("torque_offset", "coulomb_friction")
+
+    joint: Joint
+    v0: Float[Array, ""] | float
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["AsymmetricFriction"]:
+        forms = [("whole", 0.005), ("whole", 0.03), ("extra", 0.005), ("extra", 0.03)]
+        forms += [("viscous", 0.01), ("viscous extra", 0.01), ("both", 0.005), ("both", 0.03)]
+        return [cls(j, v0, form) for form, v0 in forms for j in range(arm.dof)]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        level = Coefficient("coulomb", "N·m", sign=1)
+        difference = Coefficient("coulomb_asymmetry", "N·m")
+        slope = Coefficient("damping", "N·m·s/rad", sign=1)
+        bend = Coefficient("damping_asymmetry", "N·m·s/rad")
+        return {
+            "whole": (level, difference),
+            "extra": (difference,),
+            "viscous": (slope, bend),
+            "viscous extra": (bend,),
+            "both": (level, difference, bend),
+        }[self.form]
+
+    @property
+    def equation(self) -> str:
+        return (
+            "tau = "
+            + {
+                "whole": "coulomb * tanh(dq / v0) + coulomb_asymmetry * tanh(dq / v0)^2",
+                "extra": "coulomb_asymmetry * tanh(dq / v0)^2",
+                "viscous": "damping * dq + damping_asymmetry * |dq|",
+                "viscous extra": "damping_asymmetry * |dq|",
+                "both": "coulomb * tanh(dq / v0) + coulomb_asymmetry * tanh(dq / v0)^2 + damping_asymmetry * |dq|",
+            }[self.form]
+        )
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        qd = s.qd[self.joint]
+        sign = smooth_sign(qd, self.v0)
+        return jnp.stack(
+            {
+                "whole": [sign, sign**2],
+                "extra": [sign**2],
+                "viscous": [qd, qd * sign],
+                "viscous extra": [qd * sign],
+                "both": [sign, sign**2, qd * sign],
+            }[self.form]
+        )
+
+
+class StribeckFriction(AbstractInstantEffect):
+    r"""Friction that falls with speed near zero velocity.
+
+    $$\tau_j = \left(F_c + (F_s - F_c)\,e^{-(|\dot q_j|/v_s)^\delta}\right) \tanh(\dot q_j / v_0)$$
+
+    Form "extra" leaves out $F_c$, for a joint whose model holds it already.
+
+    References:
+        Armstrong-Hélouvry 1991; Olsson et al., European Journal of Control 1998.
+    """
+
+    name: ClassVar[str] = "stribeck_friction"
+    shapes: ClassVar[tuple[Shape, ...]] = (
+        Shape("stribeck_velocity", "rad/s", 5e-3, 0.6),
+        Shape("v0", "rad/s", 1e-3, 0.05),
+    )
+    reveals: ClassVar[str] = "slow ramps through zero velocity, in several poses"
+    confounded_with: ClassVar[tuple[str, ...]] = (
+        "coulomb_friction",
+        "presliding_hysteresis",
+        "viscous_friction",
+    )
+
+    joint: Joint
+    stribeck_velocity: Float[Array, ""] | float
+    v0: Float[Array, ""] | float
+    exponent: Float[Array, ""] | float
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["StribeckFriction"]:
+        return [
+            cls(j, vs, v0, exponent, form)
+            for form in ("whole", "extra", "viscous")
+            for exponent in ((1.0, 2.0) if form != "viscous" else (2.0,))
+            for vs in (0.02, 0.05, 0.1, 0.2, 0.35)
+            for v0 in ((0.004, 0.02) if vs > 0.03 else (0.004,))
+            for j in range(arm.dof)
+        ]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        level, excess = Coefficient("coulomb", "N·m", sign=1), Coefficient("static_excess", "N·m", sign=1)
+        slope = Coefficient("damping", "N·m·s/rad", sign=1)
+        return {"whole": (level, excess), "extra": (excess,), "viscous": (level, excess, slope)}[self.form]
+
+    @property
+    def equation(self) -> str:
+        bump = "static_excess * exp(-(|dq| / stribeck_velocity)^exponent)"
+        law = bump if self.form == "extra" else f"(coulomb + {bump})"
+        return f"tau = {law} * tanh(dq / v0)" + (" + damping * dq" if self.form == "viscous" else "")
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        qd = s.qd[self.joint]
+        sign = smooth_sign(qd, self.v0)
+        bump = sign * jnp.exp(-((jnp.abs(qd) / self.stribeck_velocity + 1e-12) ** self.exponent))
+        return jnp.stack({"whole": [sign, bump], "extra": [bump], "viscous": [sign, bump, qd]}[self.form])
+
+
+class LoadDependentFriction(AbstractInstantEffect):
+    r"""Friction that grows with the transmitted torque, $\tau_j = (F_c + \mu\,|\tau_{load}|) \tanh(\dot q_j / v_0)$.
+
+    $\tau_{load}$ is the torque of the rigid arm at the joint. Form "extra" leaves out $F_c$.
+
+    References:
+        Bittencourt et al., IROS 2010; Duclusaud et al., arXiv 2410.08650.
+    """
+
+    name: ClassVar[str] = "load_dependent_friction"
+    shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
+    reveals: ClassVar[str] = "the same speed in loaded and unloaded poses; with and without payload"
+    confounded_with: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_gain", "friction_drift")
+
+    joint: Joint
+    v0: Float[Array, ""] | float
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["LoadDependentFriction"]:
+        return [
+            cls(j, v0, form)
+            for form in ("extra", "whole")
+            for v0 in (0.004, 0.02, 0.06)
+            for j in range(arm.dof)
+        ]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        growth = Coefficient("load_coefficient", "1", sign=1)
+        return (growth,) if self.form == "extra" else (growth, Coefficient("coulomb", "N·m", sign=1))
+
+    @property
+    def equation(self) -> str:
+        level = "" if self.form == "extra" else "coulomb + "
+        return f"tau = ({level}load_coefficient * |tau_load|) * tanh(dq / v0)"
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        sign = smooth_sign(s.qd[self.joint], self.v0)
+        loaded = jnp.abs(s.load[self.joint]) * sign
+        return jnp.stack([loaded] if self.form == "extra" else [loaded, sign])
+
+
+class FrictionDrift(AbstractInstantEffect):
+    r"""Friction that changes slowly over a recording, as when a joint warms up.
+
+    $$\tau_j = g(t)\,(a \tanh(\dot q_j / v_0) + b\,\dot q_j) + F_c \tanh(\dot q_j / v_0) + F_v \dot q_j, \qquad
+      g(t) = 1 - e^{-t/T}$$
+
+    A long time constant is a linear trend. Form "level" has `a` and `F_c` only, "slope" `b` and `F_v`; "... extra"
+    leaves out the constant part.
+
+    References:
+        Simoni et al., Robotica 2017; Wolf and Iskandar, ICRA 2018.
+    """
+
+    name: ClassVar[str] = "friction_drift"
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0), _WIDTH)
+    reveals: ClassVar[str] = "the same motion cold and warm"
+    confounded_with: ClassVar[tuple[str, ...]] = (
+        "coulomb_friction",
+        "load_dependent_friction",
+        "torque_drift",
+    )
+
+    joint: Joint
+    time_constant: Float[Array, ""] | float
+    v0: Float[Array, ""] | float
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["FrictionDrift"]:
+        forms = ("level extra", "level", "slope extra", "slope", "both extra")
+        return [
+            cls(j, T, v0, form)
+            for form in forms
+            for T in (2.0, 6.0, 20.0, 300.0)
+            for v0 in ((0.005, 0.03) if form.startswith("level") else (0.01,))
+            for j in range(arm.dof)
+        ]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        level, slope = Coefficient("coulomb_change", "N·m"), Coefficient("damping_change", "N·m·s/rad")
+        return {
+            "level extra": (level,),
+            "level": (level, Coefficient("coulomb", "N·m")),
+            "slope extra": (slope,),
+            "slope": (slope, Coefficient("damping", "N·m·s/rad")),
+            "both extra": (level, slope),
+        }[self.form]
+
+    @property
+    def equation(self) -> str:
+        g = "(1 - exp(-t / time_constant))"
+        return (
+            "tau = "
+            + {
+                "level extra": f"coulomb_change * {g} * tanh(dq / v0)",
+                "level": f"(coulomb + coulomb_change * {g}) * tanh(dq / v0)",
+                "slope extra": f"damping_change * {g} * dq",
+                "slope": f"(damping + damping_change * {g}) * dq",
+                "both extra": f"{g} * (coulomb_change * tanh(dq / v0) + damping_change * dq)",
+            }[self.form]
+        )
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        qd = s.qd[self.joint]
+        g = -jnp.expm1(-s.t / self.time_constant)
+        sign = smooth_sign(qd, self.v0)
+        return jnp.stack(
+            {
+                "level extra": [g * sign],
+                "level": [g * sign, sign],
+                "slope extra": [g * qd],
+                "slope": [g * qd, qd],
+                "both extra": [g * sign, g * qd],
+            }[self.form]
+        )
+
+
+EFFECTS = (
+    ViscousFriction,
+    CoulombFriction,
+    AsymmetricFriction,
+    StribeckFriction,
+    LoadDependentFriction,
+    FrictionDrift,
+)

@@ -1,0 +1,261 @@
+"""What the arm carries and how it stands: inertias of links, payloads, gravity."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..arm import Arm
+from .effect import AbstractArmEffect, Coefficient, Shape
+from .motion import Motion
+
+_MOMENTS = ("first_moment_x", "first_moment_y", "first_moment_z")
+_INERTIAS = ("inertia_xx", "inertia_xy", "inertia_yy", "inertia_xz", "inertia_yz", "inertia_zz")
+_REACH = 0.12
+"""Where a payload's centre of mass is expected, along the last link's axis from its origin [m]."""
+
+
+def _body(
+    base: Float[np.ndarray, "10"], mass: float, moment: float, inertia: float, sign: int
+) -> tuple[Float[np.ndarray, "10 10"], tuple[Coefficient, ...]]:
+    """Standard parameters of each coefficient, and the coefficients: a body like `base`, and departures from it."""
+    directions = np.eye(10)
+    directions[:, 0] = base
+    coefficients = (
+        Coefficient("mass", "kg", sign=sign, scale=mass),
+        *(Coefficient(name, "kg·m", scale=moment) for name in _MOMENTS),
+        *(Coefficient(name, "kg·m²", scale=inertia) for name in _INERTIAS),
+    )
+    return directions, coefficients
+
+
+def _unit_payload() -> Float[np.ndarray, "10"]:
+    return np.array([1.0, 0.0, 0.0, _REACH, _REACH**2, 0.0, _REACH**2, 0.0, 0.0, 0.0])
+
+
+def _as_body(
+    effect: AbstractArmEffect,
+    directions: Float[np.ndarray, "10 10"],
+    c: Float[np.ndarray, " n"],
+    covariance: Float[np.ndarray, "n n"],
+) -> list[dict[str, Any]]:
+    """Standard parameters of the body, about the link's frame; its centre of mass where it has a mass."""
+    phi, deviation = directions @ c, np.sqrt(np.maximum(np.diag(directions @ covariance @ directions.T), 0))
+    names = ("mass", *_MOMENTS, *_INERTIAS)
+    units = ("kg", *("kg·m",) * 3, *("kg·m²",) * 6)
+    joint = effect.joints[0] + 1
+    out = [
+        {"name": name, "joint": joint, "value": float(v), "std": float(s), "unit": unit}
+        for name, v, s, unit in zip(names, phi, deviation, units, strict=True)
+    ]
+    if phi[0] > 2 * deviation[0]:
+        for k, axis in enumerate("xyz"):
+            value = phi[1 + k] / phi[0]
+            row = directions[1 + k] - value * directions[0]
+            std = float(np.sqrt(max(row @ covariance @ row, 0.0)) / phi[0])
+            out.append(
+                {"name": f"com_{axis}", "joint": joint, "value": float(value), "std": std, "unit": "m"}
+            )
+    return out
+
+
+class InertialParameters(AbstractArmEffect):
+    r"""Mass, centre of mass or inertia of a link differ from the model: $\tau = Y_i\,\Delta\phi_i$.
+
+    The first coefficient is a change of mass that leaves the link's shape and centre of mass as they are.
+    """
+
+    name: ClassVar[str] = "inertial_parameters"
+    reveals: ClassVar[str] = "an identification motion; a reference recording from before"
+    confounded_with: ClassVar[tuple[str, ...]] = ("payload", "joint_spring", "torque_gain", "encoder_offset")
+
+    link: int = eqx.field(static=True)
+    standard: tuple[float, ...] = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["InertialParameters"]:
+        return [cls(i, tuple(float(v) for v in np.asarray(arm.standard[i]))) for i in range(arm.dof)]
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return (self.link,)
+
+    @property
+    def _basis(self):
+        base = np.array(self.standard)
+        mass = max(abs(base[0]), 0.2)
+        size = np.sqrt(max(np.abs(base[[4, 6, 9]]).max(), 1e-4) / mass)
+        return _body(
+            base / mass, 0.3 * mass, 0.3 * mass * min(size, 0.15), 0.3 * mass * min(size, 0.2) ** 2, 0
+        )
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return self._basis[1]
+
+    @property
+    def equation(self) -> str:
+        return f"tau = Y_{self.link + 1}(q, dq, ddq) * (change of link {self.link + 1}'s ten inertial parameters)"
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        return motion.regressor[:, :, 10 * self.link : 10 * self.link + 10] @ self._basis[0]
+
+    def standard_change(self, c: Float[np.ndarray, " n"]) -> tuple[int, Float[np.ndarray, "10"]]:
+        """Link, and what is added to its standard parameters."""
+        return self.link, self._basis[0] @ c
+
+    def parameters(self, c, covariance) -> list[dict[str, Any]]:
+        return _as_body(self, self._basis[0], c, covariance)
+
+
+class Payload(AbstractArmEffect):
+    r"""An unmodelled body at the flange, present throughout: $\tau = Y_n\,\phi_{payload}$ with positive mass.
+
+    Told from a wrong last link by where its centre of mass is expected: beyond the flange.
+
+    References:
+        Khalil, Gautier, Lemoine, ICRA 2007; Gaz and De Luca, IROS 2017.
+    """
+
+    name: ClassVar[str] = "payload"
+    reveals: ClassVar[str] = "a recording without the load, of the same motion"
+    confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "torque_gain")
+
+    link: int = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["Payload"]:
+        return [cls(arm.dof - 1)]
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return (self.link,)
+
+    @property
+    def _basis(self):
+        return _body(_unit_payload(), 1.0, 0.06, 0.01, 1)
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return self._basis[1]
+
+    @property
+    def equation(self) -> str:
+        return f"tau = Y_{self.link + 1}(q, dq, ddq) * (ten inertial parameters of the payload)"
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        return motion.regressor[:, :, 10 * self.link : 10 * self.link + 10] @ self._basis[0]
+
+    def standard_change(self, c: Float[np.ndarray, " n"]) -> tuple[int, Float[np.ndarray, "10"]]:
+        """Link, and what is added to its standard parameters."""
+        return self.link, self._basis[0] @ c
+
+    def parameters(self, c, covariance) -> list[dict[str, Any]]:
+        return _as_body(self, self._basis[0], c, covariance)
+
+
+class PayloadChange(AbstractArmEffect):
+    r"""A body at the flange, gained or lost at $t_0$ during a recording: $\tau = H(t - t_0)\,Y_n\,\phi$.
+
+    Form "gained": there from `start` on. Form "lost": there until `start`; the model is without it.
+    """
+
+    name: ClassVar[str] = "payload_change"
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("start", "s", -np.inf, np.inf, False),)
+    reveals: ClassVar[str] = "the same poses before and after"
+    confounded_with: ClassVar[tuple[str, ...]] = ("external_contact", "torque_drift")
+    bound_to_recording: ClassVar[bool] = True
+
+    link: int = eqx.field(static=True)
+    start: Float[Array, ""] | float
+    stop: Float[Array, ""] | float
+    recording: str = eqx.field(static=True)
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["PayloadChange"]:
+        return []  # the event scan proposes them
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return (self.link,)
+
+    @property
+    def _basis(self):
+        return _body(_unit_payload(), 1.0, 0.06, 0.01, 1)
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return self._basis[1]
+
+    @property
+    def equation(self) -> str:
+        when = {"gained": "t >= start", "lost": "t < start", "carried": "start <= t < stop"}[self.form]
+        return f"tau = Y_{self.link + 1}(q, dq, ddq) * (ten inertial parameters of the body) while {when}"
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        columns = motion.regressor[:, :, 10 * self.link : 10 * self.link + 10] @ self._basis[0]
+        return columns * window(motion.time, float(self.start), float(self.stop), motion.dt)[:, None, None]
+
+    def parameters(self, c, covariance) -> list[dict[str, Any]]:
+        joint = self.joints[0] + 1
+        when = [{"name": "start", "joint": joint, "value": float(self.start), "std": None, "unit": "s"}]
+        return _as_body(self, self._basis[0], c, covariance) + when
+
+
+class GravityDirection(AbstractArmEffect):
+    r"""A base that is not level, or a wrong gravity vector.
+
+    $$\tau = \frac{\partial \tau}{\partial g_x}\Delta g_x + \frac{\partial\tau}{\partial g_y}\Delta g_y$$
+
+    across the direction that the model has; a tilt of 1 degree is 0.17 m/s².
+    """
+
+    name: ClassVar[str] = "gravity_direction"
+    reveals: ClassVar[str] = "the first joint turned over 180 degrees"
+    confounded_with: ClassVar[tuple[str, ...]] = ("joint_spring", "torque_offset", "inertial_parameters")
+
+    across: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["GravityDirection"]:
+        g = np.asarray(arm.chain.gravity, float)
+        along = g / max(np.linalg.norm(g), 1e-9)
+        axes = [e - along * along[k] for k, e in enumerate(np.eye(3))]
+        kept = sorted(range(3), key=lambda k: abs(along[k]))[:2]
+        rows = [axes[k] / np.linalg.norm(axes[k]) for k in sorted(kept)]
+        return [cls(tuple(tuple(float(v) for v in row) for row in rows))]
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return ()
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"gravity_{axis}", "m/s²", scale=0.3) for axis in "xy")
+
+    @property
+    def equation(self) -> str:
+        return "tau = tau(g + gravity_x * e_x + gravity_y * e_y) - tau(g)"
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        return motion.gravity_columns @ np.array(self.across).T
+
+    def gravity_change(self, c: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
+        """What is added to the gravity vector [m/s²]."""
+        return c @ np.array(self.across)
+
+    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+        return {"gravity": np.asarray(arm.chain.gravity) + self.gravity_change(c)}
+
+
+def window(
+    time: Float[np.ndarray, " time"], start: float, stop: float, dt: float
+) -> Float[np.ndarray, " time"]:
+    """1 from `start` to `stop`, with edges one time step wide so that it changes smoothly with both."""
+    return np.clip((time - start) / dt + 0.5, 0, 1) * np.clip((stop - time) / dt + 0.5, 0, 1)
+
+
+EFFECTS = (InertialParameters, Payload, PayloadChange, GravityDirection)

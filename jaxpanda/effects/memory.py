@@ -1,0 +1,83 @@
+"""Friction with memory around reversals, and the backlash of a gear."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..arm import Arm
+from .effect import AbstractMemoryEffect, Coefficient, Shape, smooth_sign
+from .motion import Channels, Joint
+
+
+class PreslidingHysteresis(AbstractMemoryEffect):
+    r"""Friction that builds up over a distance after each reversal, whatever the speed.
+
+    Dahl's form, $\tau_j = F_c z$ with $dz = (\mathrm{sign}(\dot q) - z)\,|\dot q|\,dt / x_s$, and the Jenkins
+    element of Maxwell-slip models, $dz = \dot q\,dt / x_s$ with $|z| \le 1$. Form "... extra" has
+    $z - \tanh(\dot q / v_0)$, for a joint whose model holds Coulomb friction at its full level already; "... whole"
+    has both levels free.
+
+    References:
+        Dahl 1968; Al-Bender, Lampaert, Swevers, IEEE TAC 2005.
+    """
+
+    name: ClassVar[str] = "presliding_hysteresis"
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("breakaway_distance", "rad", 1e-4, 0.2),)
+    reveals: ClassVar[str] = "slow reversals of half to five breakaway distances"
+    confounded_with: ClassVar[tuple[str, ...]] = (
+        "coulomb_friction",
+        "stribeck_friction",
+        "backlash",
+        "time_delay",
+    )
+
+    joint: Joint
+    breakaway_distance: Float[Array, ""] | float
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["PreslidingHysteresis"]:
+        distances = (1e-3, 2.5e-3, 6e-3, 0.015, 0.035, 0.08)
+        forms = [f"{law} {extent}" for law in ("dahl", "jenkins") for extent in ("only", "extra", "whole")]
+        return [cls(j, x, form) for form in forms for x in distances for j in range(arm.dof)]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        level = Coefficient("friction_level", "N·m", sign=1)
+        return (level, Coefficient("coulomb", "N·m")) if self.form.endswith("whole") else (level,)
+
+    @property
+    def equation(self) -> str:
+        law = {
+            "dahl": "dz = (sign(dq) - z) * |dq| * dt / breakaway_distance",
+            "jenkins": "dz = dq * dt / breakaway_distance, |z| <= 1",
+        }[self.form.split()[0]]
+        torque = {
+            "only": "friction_level * z",
+            "extra": "friction_level * (z - sign(dq))",
+            "whole": "friction_level * z + coulomb * sign(dq)",
+        }[self.form.split()[1]]
+        return f"tau = {torque}, {law}"
+
+    def start(self, s: Channels) -> Float[Array, " states"]:
+        return smooth_sign(s.qd[self.joint], 0.01)[None]
+
+    def step(
+        self, z: Float[Array, " states"], s: Channels, dt: float
+    ) -> tuple[Float[Array, " states"], Float[Array, " n"]]:
+        qd = s.qd[self.joint]
+        moved = qd * dt / self.breakaway_distance
+        if self.form.startswith("dahl"):
+            sign = jnp.sign(qd)
+            z = sign + (z - sign) * jnp.exp(-jnp.abs(moved))
+        else:
+            z = jnp.clip(z + moved, -1.0, 1.0)
+        sign = smooth_sign(qd, 0.005)[None]
+        extent = self.form.split()[1]
+        return z, {"only": z, "extra": z - sign, "whole": jnp.concatenate([z, sign])}[extent]
+
+
+EFFECTS = (PreslidingHysteresis,)

@@ -1,0 +1,175 @@
+"""What effects are evaluated on: the motion of an arm on a uniform grid, and the nominal model's torque in it."""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxpanda_kernels import link_poses, regressor, rnea
+from jaxtyping import Array, Float, Int
+
+from ..arm import Arm
+
+_CHUNK = 1024
+"""Samples that one compiled call takes: recordings of any length share its compilation."""
+
+
+class Channels(eqx.Module):
+    """Joint-wise channels; at one instant `(dof,)`, over a recording `(time, dof)`."""
+
+    t: Float[Array, "*time"]
+    """Clock of the recording [s]."""
+    q: Float[Array, "*time dof"]
+    qd: Float[Array, "*time dof"]
+    qdd: Float[Array, "*time dof"]
+    load: Float[Array, "*time dof"]
+    """Torque that the nominal rigid arm transmits [N m]."""
+    torque: Float[Array, "*time dof"]
+    """Torque of the whole nominal model, friction included [N m]."""
+
+
+class Motion:
+    """A motion on a uniform grid; what the nominal arm says about it is computed once, when asked for.
+
+    `friction` is the torque of the friction that the nominal model holds [N m].
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        time: Float[np.ndarray, " time"],
+        q: Float[np.ndarray, "time dof"],
+        qd: Float[np.ndarray, "time dof"],
+        qdd: Float[np.ndarray, "time dof"],
+        friction: Float[np.ndarray, "time dof"],
+    ):
+        self.arm, self.time, self.q, self.qd, self.qdd, self.friction = arm, time, q, qd, qdd, friction
+        self.dt = float(time[1] - time[0])
+
+    @property
+    def samples(self) -> int:
+        return len(self.time)
+
+    @property
+    def dof(self) -> int:
+        return self.q.shape[1]
+
+    @functools.cached_property
+    def load(self) -> Float[np.ndarray, "time dof"]:
+        """Torque of the nominal rigid arm with armature and springs [N m]: all of the model that is smooth."""
+        return self._over(_smooth_torque, self.q, self.qd, self.qdd)
+
+    @functools.cached_property
+    def regressor(self) -> Float[np.ndarray, "time dof standard"]:
+        """Regressor of the standard parameters, ten a link."""
+        return self._over(_regressor, self.q, self.qd, self.qdd)
+
+    @functools.cached_property
+    def gravity_columns(self) -> Float[np.ndarray, "time dof 3"]:
+        """Derivative of the torque by the gravity vector in the base frame [N m s²/m]."""
+        return self._over(_gravity_columns, self.q)
+
+    @functools.cached_property
+    def wrench_columns(self) -> Float[np.ndarray, "time links dof 6"]:
+        """Torque of the motors that a unit force (3) and moment (3) at each link's origin, along the base's axes,
+        calls for: $-J_i^\\top$."""
+        return self._over(_wrench_columns, self.q)
+
+    @functools.cached_property
+    def link_axes(self) -> Float[np.ndarray, "time links 3 3"]:
+        """Axes of every link in the base frame."""
+        return self._over(_link_axes, self.q)
+
+    @functools.cached_property
+    def load_rates(self) -> tuple[Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"]]:
+        """First and second derivative in time of `load` [N m/s, N m/s²]."""
+        rate = np.gradient(self.load, self.dt, axis=0)
+        return rate, np.gradient(rate, self.dt, axis=0)
+
+    def sensitivity(self, dq: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, "time dof"]:
+        """Change of the smooth torque [N m] for a small change `dq(t)` of the joint positions, to first order."""
+        dqd = np.gradient(dq, self.dt, axis=0)
+        dqdd = np.gradient(dqd, self.dt, axis=0)
+        return self._over(_sensitivity, self.q, self.qd, self.qdd, dq, dqd, dqdd)
+
+    def moved(self, dq: Float[np.ndarray, "time dof"]) -> "Motion":
+        """The motion with `dq(t)` added to the joint positions."""
+        dqd = np.gradient(dq, self.dt, axis=0)
+        dqdd = np.gradient(dqd, self.dt, axis=0)
+        return Motion(self.arm, self.time, self.q + dq, self.qd + dqd, self.qdd + dqdd, self.friction)
+
+    @property
+    def torque(self) -> Float[np.ndarray, "time dof"]:
+        """Torque of the whole nominal model [N m]."""
+        return self.load + self.friction
+
+    def _over(self, function: Callable, *arrays: np.ndarray) -> np.ndarray:
+        """`function(arm, *arrays)` in chunks of one shape."""
+        out = []
+        for start in range(0, self.samples, _CHUNK):
+            parts = [a[start : start + _CHUNK] for a in arrays]
+            short = _CHUNK - len(parts[0])
+            padded = [np.concatenate([p, np.repeat(p[-1:], short, 0)]) if short else p for p in parts]
+            out.append(np.asarray(function(self.arm, *padded))[: _CHUNK - short])
+        return np.concatenate(out)
+
+
+def _smooth(arm: Arm, q: Array, qd: Array, qdd: Array) -> Array:
+    rigid = rnea(arm.chain, arm.standard, q, qd, qdd)
+    return rigid + arm.armature * qdd + arm.stiffness * (q - arm.springref)
+
+
+@jax.jit
+def _smooth_torque(arm, q, qd, qdd):
+    return jax.vmap(lambda *s: _smooth(arm, *s))(q, qd, qdd)
+
+
+@jax.jit
+def _regressor(arm, q, qd, qdd):
+    Y = jax.vmap(lambda *s: regressor(arm.chain, *s))(q, qd, qdd)
+    return Y.reshape(*Y.shape[:2], -1)
+
+
+@jax.jit
+def _gravity_columns(arm, q):
+    def torque(g, q):
+        chain = eqx.tree_at(lambda c: c.gravity, arm.chain, g)
+        return rnea(chain, arm.standard, q, jnp.zeros_like(q), jnp.zeros_like(q))
+
+    return jax.vmap(jax.jacfwd(torque), (None, 0))(arm.chain.gravity, q)
+
+
+@jax.jit
+def _sensitivity(arm, q, qd, qdd, dq, dqd, dqdd):
+    def one(q, qd, qdd, dq, dqd, dqdd):
+        return jax.jvp(lambda *s: _smooth(arm, *s), (q, qd, qdd), (dq, dqd, dqdd))[1]
+
+    return jax.vmap(one)(q, qd, qdd, dq, dqd, dqdd)
+
+
+@jax.jit
+def _wrench_columns(arm, q):
+    def one(q):
+        R, p = link_poses(arm.chain, q)
+        z = R[:, :, 2]
+        turns = ~arm.chain.prismatic
+
+        def at(link):
+            linear = jnp.where(turns[:, None], jnp.cross(z, p[link] - p), z)
+            angular = jnp.where(turns[:, None], z, 0.0)
+            carried = (jnp.arange(q.shape[0]) <= link)[:, None]
+            return -jnp.where(carried, jnp.concatenate([linear, angular], 1), 0.0)
+
+        return jax.vmap(at)(jnp.arange(q.shape[0]))
+
+    return jax.vmap(one)(q)
+
+
+@jax.jit
+def _link_axes(arm, q):
+    return jax.vmap(lambda q: link_poses(arm.chain, q)[0])(q)
+
+
+Joint = Int[Array, ""] | int

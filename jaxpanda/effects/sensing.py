@@ -1,0 +1,238 @@
+"""What the sensors add: offsets, scales, drift, crosstalk, and clocks out of step."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..arm import Arm
+from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape
+from .motion import Channels, Joint, Motion
+
+
+class TorqueOffset(AbstractInstantEffect):
+    r"""Constant bias of a torque sensor, $\tau_j = b$."""
+
+    name: ClassVar[str] = "torque_offset"
+    reveals: ClassVar[str] = "rests, and poses on both sides of the joint's zero of gravity"
+    confounded_with: ClassVar[tuple[str, ...]] = (
+        "asymmetric_friction",
+        "joint_spring",
+        "inertial_parameters",
+    )
+    sensor: ClassVar[bool] = True
+
+    joint: Joint
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["TorqueOffset"]:
+        return [cls(j) for j in range(arm.dof)]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("offset", "N·m"),)
+
+    @property
+    def equation(self) -> str:
+        return "tau = offset"
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        return jnp.ones_like(s.t)[None]
+
+
+class TorqueGain(AbstractInstantEffect):
+    r"""Wrong scale of a torque sensor, $\tau_j = e\,\tau_j^{true}$.
+
+    References:
+        Gautier and Briot, IROS 2011: a gain common to all joints needs a known load.
+    """
+
+    name: ClassVar[str] = "torque_gain"
+    reveals: ClassVar[str] = "a known load at the flange"
+    confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "payload", "load_dependent_friction")
+    sensor: ClassVar[bool] = True
+
+    joint: Joint
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["TorqueGain"]:
+        return [cls(j) for j in range(arm.dof)]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("gain_error", "1"),)
+
+    @property
+    def equation(self) -> str:
+        return "tau_measured = (1 + gain_error) * tau"
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        return s.torque[self.joint][None]
+
+
+class TorqueDrift(AbstractInstantEffect):
+    r"""Bias of a torque sensor that changes over time, $\tau_j = a\,g(t) + b$ with $g = 1 - e^{-t/T}$.
+
+    A long time constant is a linear trend. Form "... extra" is without the constant; "wave" is
+    $a \sin(2\pi t/T) + b \cos(2\pi t/T)$, a bias that wanders.
+    """
+
+    name: ClassVar[str] = "torque_drift"
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0),)
+    reveals: ClassVar[str] = "the same poses early and late"
+    confounded_with: ClassVar[tuple[str, ...]] = ("payload_change", "friction_drift", "torque_offset")
+    sensor: ClassVar[bool] = True
+
+    joint: Joint
+    time_constant: Float[Array, ""] | float
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["TorqueDrift"]:
+        shapes = [("extra", T) for T in (2.0, 6.0, 20.0, 500.0)] + [
+            ("offset", T) for T in (2.0, 6.0, 20.0, 500.0)
+        ]
+        shapes += [("wave", T) for T in (10.0, 20.0, 40.0)]
+        return [cls(j, T, form) for form, T in shapes for j in range(arm.dof)]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        if self.form == "wave":
+            return (Coefficient("sine", "N·m"), Coefficient("cosine", "N·m"))
+        change = Coefficient("change", "N·m")
+        return (change,) if self.form == "extra" else (change, Coefficient("offset", "N·m"))
+
+    @property
+    def equation(self) -> str:
+        return (
+            "tau = "
+            + {
+                "extra": "change * (1 - exp(-t / time_constant))",
+                "offset": "offset + change * (1 - exp(-t / time_constant))",
+                "wave": "sine * sin(2 pi t / time_constant) + cosine * cos(2 pi t / time_constant)",
+            }[self.form]
+        )
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        phase = s.t / self.time_constant
+        if self.form == "wave":
+            return jnp.stack([jnp.sin(2 * jnp.pi * phase), jnp.cos(2 * jnp.pi * phase)])
+        g = -jnp.expm1(-phase)
+        return jnp.stack([g] if self.form == "extra" else [g, jnp.ones_like(g)])
+
+
+class TorqueCrosstalk(AbstractInstantEffect):
+    r"""Torque of one joint appearing in another's sensor, $\tau_j = e\,\tau_k$."""
+
+    name: ClassVar[str] = "torque_crosstalk"
+    reveals: ClassVar[str] = "poses in which the two joints' torques differ"
+    confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction")
+    sensor: ClassVar[bool] = True
+
+    joint: Joint
+    source: Joint
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["TorqueCrosstalk"]:
+        return [cls(j, k) for j in range(arm.dof) for k in range(arm.dof) if j != k]
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient(f"crosstalk_from_{int(self.source) + 1}", "1"),)
+
+    @property
+    def equation(self) -> str:
+        return f"tau = crosstalk_from_{int(self.source) + 1} * tau_{int(self.source) + 1}"
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        return s.torque[self.source][None]
+
+
+class EncoderOffset(AbstractArmEffect):
+    r"""Constant bias of a position sensor, $\tau(q + \Delta q_j) - \tau(q)$ to first order."""
+
+    name: ClassVar[str] = "encoder_offset"
+    reveals: ClassVar[str] = "the joint at rest over its range; with and without payload"
+    confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction", "joint_spring")
+    sensor: ClassVar[bool] = True
+
+    joint: Joint
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["EncoderOffset"]:
+        return [cls(j) for j in range(arm.dof)]
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return (int(self.joint),)
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("offset", "rad"),)
+
+    @property
+    def equation(self) -> str:
+        return "q_true = q_measured + offset"
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        dq = np.zeros_like(motion.q)
+        dq[:, int(self.joint)] = 1.0
+        return motion.sensitivity(dq)[..., None]
+
+
+class TimeDelay(AbstractArmEffect):
+    r"""Torque later than motion by d: $\tau_{measured}(t) = \tau(t - d)$.
+
+    Columns are $(\tau(t - d_0) - \tau(t))/d_0$ of the nominal torque, so that the coefficient is d near $d_0$.
+    """
+
+    name: ClassVar[str] = "time_delay"
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "s", -0.2, 0.2, False),)
+    reveals: ClassVar[str] = "fast reversals"
+    confounded_with: ClassVar[tuple[str, ...]] = (
+        "viscous_friction",
+        "presliding_hysteresis",
+        "joint_elasticity",
+    )
+    sensor: ClassVar[bool] = True
+
+    dof: int = eqx.field(static=True)
+    around: float
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["TimeDelay"]:
+        return [cls(arm.dof, d) for d in (-0.02, -0.005, 0.002, 0.005, 0.01, 0.02, 0.04)]
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return tuple(range(self.dof))
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("delay", "s", sign=1 if self.around > 0 else -1),)
+
+    @property
+    def equation(self) -> str:
+        return "tau_measured(t) = tau(t - delay)"
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        torque, late = motion.torque, motion.time - self.around
+        shifted = np.stack([np.interp(late, motion.time, torque[:, j]) for j in range(motion.dof)], 1)
+        return ((shifted - torque) / abs(self.around))[..., None] * np.sign(self.around)
+
+    def parameters(self, c, covariance):
+        std = float(np.sqrt(max(covariance[0, 0], 0.0)))
+        return [{"name": "delay", "joint": None, "value": float(c[0]), "std": std, "unit": "s"}]
+
+
+EFFECTS = (
+    TorqueOffset,
+    TorqueGain,
+    TorqueDrift,
+    TorqueCrosstalk,
+    EncoderOffset,
+    TimeDelay,
+)
