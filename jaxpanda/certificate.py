@@ -8,6 +8,8 @@ value no feasible set of links can be below.
 import dataclasses
 import time
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import inertia
 from jaxtyping import Float
@@ -102,7 +104,8 @@ def lower_bound(
 
 def _pseudo_inertias(dof: int) -> np.ndarray:
     """From phi to the pseudo-inertias' stacked upper triangles, off-diagonal entries times sqrt 2."""
-    one = np.stack([np.asarray(inertia.pseudo_inertia(unit))[_ROW, _COLUMN] for unit in np.eye(10)], -1)
+    of_units = np.asarray(jax.vmap(inertia.pseudo_inertia)(jnp.eye(10)))
+    one = of_units[:, _ROW, _COLUMN].T
     return np.kron(np.eye(dof), np.where(_ROW == _COLUMN, 1.0, np.sqrt(2.0))[:, None] * one)
 
 

@@ -118,10 +118,11 @@ class Bounds:
 
         Mass: a fifth to three times the nominal one (at least up to 0.1 kg). Centre of mass: the box around
         the link's own joint, the next joint and the nominal centre of mass, widened by 0.05 m and a quarter
-        of its size. Inertia: what the largest mass at the box's corners would have. Total mass: nominal
-        within 25 %. Wide on purpose: they keep the starts near the arm, they are not knowledge about it.
+        of its size. Inertia: what the largest mass at the box's corners would have (at least twice the
+        nominal one). Total mass: nominal within 25 %. Wide on purpose: they keep the starts near the arm,
+        they are not knowledge about it.
         """
-        mass, com, _ = (np.asarray(x) for x in jax.vmap(inertia.to_com)(arm.standard))
+        mass, com, I_com = (np.asarray(x) for x in jax.vmap(inertia.to_com)(arm.standard))
         # The next joint in this link's frame; the last link has none, its own origin stands in.
         tips = np.concatenate([np.asarray(arm.chain.p)[1:], np.zeros((1, 3))])
         corners = np.stack([np.zeros_like(tips), tips, com])
@@ -129,7 +130,8 @@ class Bounds:
         margin = 0.05 + 0.25 * (high - low)
         low, high = low - margin, high + margin
         heaviest = np.maximum(3 * mass, 0.1)
-        largest = heaviest * np.sum((high - low) ** 2, -1)
+        nominal = np.abs(I_com).max((1, 2))
+        largest = np.maximum(heaviest * np.sum((high - low) ** 2, -1), 2 * nominal)
         return cls(
             mass=np.stack([mass / 5, heaviest], -1),
             com=np.stack([low, high], -1),

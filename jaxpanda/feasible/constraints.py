@@ -8,6 +8,7 @@ units of its own. It need not be convex, and anything that JAX can differentiate
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -40,6 +41,7 @@ class Links(eqx.Module):
 
 
 Constraint = Callable[[Links], Array]
+Points = Sequence[Any] | np.ndarray
 
 
 def triangle_inequality(links: Links) -> Float[Array, " dof"]:
@@ -55,7 +57,7 @@ def total_mass(lower: float, upper: float) -> Constraint:
     return lambda links: jnp.stack([jnp.sum(links.mass) - lower, upper - jnp.sum(links.mass)])
 
 
-def com_in_hull(link: int, points: Sequence[Sequence[float]] | Float[np.ndarray, "n 3"]) -> Constraint:
+def com_in_hull(link: int, points: Points) -> Constraint:
     """The centre of mass of `link` (0-based) lies in the convex hull of `points` (link's frame [m]).
 
     The margins are the distances [m] to the hull's faces, inside positive.
@@ -73,7 +75,7 @@ def com_in_hull(link: int, points: Sequence[Sequence[float]] | Float[np.ndarray,
     return lambda links: -(normals @ links.com[link] + offsets)
 
 
-def com_in_cylinder(link: int, start: Sequence[float], end: Sequence[float], radius: float) -> Constraint:
+def com_in_cylinder(link: int, start: Points, end: Points, radius: float) -> Constraint:
     """The centre of mass of `link` (0-based) lies in the cylinder from `start` to `end` (link's frame [m]).
 
     Margins: distance [m] to either cap, and to the wall as $(r^2 - d^2)/2r$, smooth on the axis and
@@ -92,7 +94,7 @@ def com_in_cylinder(link: int, start: Sequence[float], end: Sequence[float], rad
     return margins
 
 
-def mass_in_ellipsoid(link: int, centre: Sequence[float], semi_axes: Sequence[float]) -> Constraint:
+def mass_in_ellipsoid(link: int, centre: Points, semi_axes: Points) -> Constraint:
     r"""All mass of `link` (0-based) could lie inside this ellipsoid along the link's axes [m].
 
     $m - \int (x-x_s)^\top D^{-2} (x-x_s)\,dm \ge 0$ [kg], $D$ the semi-axes: necessary for a body inside it,

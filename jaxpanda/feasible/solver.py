@@ -10,8 +10,8 @@ at infinity and crawls). Boxes on $m$, $c$ and $\theta$ are kept exactly, by pro
 **Steps.** Newton with Levenberg's damping. With $D = \partial\phi/\partial x$ and $\Gamma$ the gradient with
 respect to $\Sigma_c$, the Hessian is $2D^\top A^\top A D$ plus one block a link,
 $\mathrm{diag}(0,\, 2m\Gamma,\, 2\,\Gamma \otimes 1)$, plus a coupling of $m$ and $c$ proportional to
-$\partial f/\partial c$. At an optimum $\Gamma \succeq 0$ (it is the multiplier of the triangle inequality) and
-the coupling vanishes for every free $c$. So $\Gamma$ is replaced by its positive part and the coupling left
+$\partial f/\partial c$. At an optimum $\Gamma \succeq 0$ (the multiplier of the triangle inequality) and the
+coupling vanishes for every free $c$. So $\Gamma$ is replaced by its positive part and the coupling left
 out: each step's matrix is positive definite, and it is the exact Hessian where it matters. Gauss-Newton alone
 would converge linearly, because the residual does not vanish. Valleys curve; each step is bent along
 (`_bend`).
@@ -23,8 +23,10 @@ Every start does the same work, so that a batch of them is a batch of small dens
 """
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -132,11 +134,12 @@ def solve(
     x0 = _initial(problem, bounds, initial, starts, seed)
     padded = jnp.concatenate([x0, jnp.broadcast_to(x0[-1], ((-starts) % chunk, x0.shape[1]))])
     began = time.perf_counter()
-    run = _run_chunk.lower(problem, padded[:chunk], rounds, iterations).compile()
+    leaves, structure = jax.tree.flatten((problem, padded[:chunk]))
+    run = _compiled(structure, tuple((x.shape, x.dtype) for x in leaves), rounds, iterations)
     compiled = time.perf_counter()
     chunks = []
     for first in range(0, starts, chunk):
-        chunks.append(jax.device_get(run(problem, padded[first : first + chunk], rounds, iterations)))
+        chunks.append(jax.device_get(run(problem, padded[first : first + chunk])))
         if progress is not None:
             progress(min(first + chunk, starts), starts)
     parts = (np.concatenate(part)[:starts] for part in zip(*chunks, strict=True))
@@ -189,8 +192,6 @@ def scaled_problem(
         raise InputError(
             f"A has {A.shape[1]} columns, fewer than the ten of each of {dof} links in the bounds"
         )
-    if len(A) != len(b):
-        raise InputError(f"A has {len(A)} rows and b has {len(b)}; they must be as many")
     if not (np.all(np.isfinite(A)) and np.all(np.isfinite(b))):
         raise InputError("A or b holds a number that is not finite")
     low = np.full(extra, -np.inf) if extra_lower is None else np.asarray(extra_lower, float)
@@ -512,10 +513,12 @@ def _run_one(problem: Problem, x0: Float[Array, " columns"], rounds: int, iterat
     of_I = jax.vmap(_phi_and_inertia)(x0[:n].reshape(-1, 10))[:, 10:]
     multipliers = jax.tree.map(jnp.zeros_like, _margins(problem, _links(problem, x0, of_I), of_I))
 
+    fresh = jnp.asarray(_DAMPING, x0.dtype)
+
     def one_round(carry, weight):
         state, multipliers = carry
         value, residual = _evaluate(problem, state.x, multipliers, weight)
-        state = eqx.tree_at(lambda s: (s.value, s.residual, s.damping), state, (value, residual, _DAMPING))
+        state = eqx.tree_at(lambda s: (s.value, s.residual, s.damping), state, (value, residual, fresh))
 
         def body(state, _):
             state = _step(problem, state, multipliers, weight)
@@ -526,7 +529,7 @@ def _run_one(problem: Problem, x0: Float[Array, " columns"], rounds: int, iterat
         margins = _margins(problem, _links(problem, state.x, of_I), of_I)
         return (state, _hinges(margins, multipliers, weight)), values
 
-    state = _State(x0, jnp.zeros(()), jnp.zeros_like(problem.b), _DAMPING, jnp.zeros((), int))
+    state = _State(x0, jnp.zeros(()), jnp.zeros_like(problem.b), fresh, jnp.zeros((), int))
     weights = _WEIGHT * 10.0 ** jnp.arange(rounds)
     (state, _), values = jax.lax.scan(one_round, (state, multipliers), weights)
     phi = jax.vmap(_phi_and_inertia)(state.x[:n].reshape(-1, 10))[:, :10]
@@ -536,6 +539,9 @@ def _run_one(problem: Problem, x0: Float[Array, " columns"], rounds: int, iterat
     return phi, state.x[n:], violation, settled & (violation == 0), state.accepted
 
 
-@eqx.filter_jit
-def _run_chunk(problem: Problem, x0: Float[Array, "chunk columns"], rounds: int, iterations: int):
-    return jax.vmap(lambda x: _run_one(problem, x, rounds, iterations))(x0)
+@functools.lru_cache(maxsize=16)
+def _compiled(structure: Any, leaves: tuple[tuple[Any, Any], ...], rounds: int, iterations: int) -> Callable:
+    """The program for a chunk of starts; kept, because cross-validation solves one shape many times."""
+    problem, x0 = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
+    run = jax.jit(jax.vmap(lambda problem, x0: _run_one(problem, x0, rounds, iterations), in_axes=(None, 0)))
+    return run.lower(problem, x0).compile()

@@ -1,0 +1,235 @@
+"""Bounds, constraints and the many-start solver."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxpanda_kernels import inertia
+
+from jaxpanda.errors import InputError
+from jaxpanda.feasible import (
+    Bounds,
+    Links,
+    com_in_cylinder,
+    com_in_hull,
+    mass_in_ellipsoid,
+    solve,
+    total_mass,
+    triangle_inequality,
+    when,
+)
+from jaxpanda.panda import panda
+
+
+def boxes(dof: int, total: tuple[float, float] | None = None) -> Bounds:
+    return Bounds(
+        mass=np.tile([0.1, 10.0], (dof, 1)),
+        com=np.tile([-0.2, 0.2], (dof, 3, 1)),
+        inertia=np.tile([[0.0, 1.0]] * 3 + [[-1.0, 1.0]] * 3, (dof, 1, 1)),
+        total_mass=None if total is None else np.array(total),
+    )
+
+
+def least_eigenvalue(phi: np.ndarray) -> float:
+    """Least eigenvalue of the second moment about the centre of mass, in plain numpy."""
+    m, h, (xx, xy, yy, xz, yz, zz) = phi[0], phi[1:4], phi[4:]
+    I = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return np.linalg.eigvalsh(0.5 * np.trace(I) * np.eye(3) - I - np.outer(h, h) / m)[0]
+
+
+@pytest.fixture(scope="module")
+def truth() -> np.ndarray:
+    """Two real bodies."""
+    eta = 0.3 * jax.random.normal(jax.random.key(3), (2, 10)) + jnp.array([0.3, *[-3.0] * 3, *[0.0] * 6])
+    eta = eta.at[:, 4:].multiply(0.1)
+    return np.asarray(jax.vmap(inertia.from_log_cholesky)(eta))
+
+
+@pytest.fixture(scope="module")
+def reachable(truth):
+    """Fewer equations than unknowns, which two real bodies and one friction coefficient satisfy."""
+    A = np.random.default_rng(0).normal(size=(12, 21))
+    A[:, 20] *= 0.1
+    b = A @ np.append(truth.ravel(), 0.5)
+    bounds = boxes(2, (1.0, 6.0))
+    options = {"extra_lower": np.array([0.3]), "extra_upper": np.array([0.7]), "initial": truth[None]}
+    told = []
+    found = solve(
+        A, b, bounds, starts=64, chunk=24, progress=lambda done, of: told.append((done, of)), **options
+    )
+    assert told == [(24, 64), (48, 64), (64, 64)]
+    return A, b, bounds, found
+
+
+def test_a_reachable_right_hand_side_is_reached_from_most_starts(reachable):
+    A, b, _, found = reachable
+    assert np.mean((found.objective < 1e-10) & (found.violation == 0)) > 0.9
+    x = np.concatenate([found.phi.reshape(64, -1), found.extra], 1)
+    np.testing.assert_allclose(np.sum((x @ A.T - b) ** 2, 1), found.objective, atol=1e-20)
+
+
+def test_no_violation_means_that_numpy_finds_none_either(reachable):
+    _, _, bounds, found = reachable
+    for phi in found.phi[found.violation == 0]:
+        mass, com = phi[:, 0], phi[:, 1:4] / phi[:, :1]
+        assert np.all((mass >= bounds.mass[:, 0]) & (mass <= bounds.mass[:, 1]))
+        assert np.all((com >= bounds.com[..., 0]) & (com <= bounds.com[..., 1]))
+        assert 1.0 <= mass.sum() <= 6.0
+        assert all(least_eigenvalue(link) > 0 for link in phi)
+
+
+def test_extra_unknowns_stay_in_their_bounds(reachable):
+    found = reachable[-1]
+    assert np.all((found.extra >= 0.3) & (found.extra <= 0.7))
+
+
+def test_the_same_seed_gives_the_same_starts_whatever_the_chunk():
+    A, b = np.eye(10)[:1], np.array([5.0])
+    found = [solve(A, b, boxes(1), starts=6, chunk=chunk, rounds=1, iterations=1) for chunk in (6, 4)]
+    for other in found[1:]:
+        np.testing.assert_allclose(other.phi, found[0].phi, rtol=1e-9)
+    assert len(np.unique(found[0].phi[:, 0, 3])) == 6
+
+
+def test_a_user_constraint_binds_where_it_should_and_is_not_violated():
+    """min (m - 5)² under m <= 3: the answer is m = 3 and 4."""
+    A = np.eye(10)[:1]
+    found = solve(A, np.array([5.0]), boxes(1), constraints=[lambda links: 3.0 - links.mass], starts=8)
+    assert np.all(found.violation == 0)
+    np.testing.assert_allclose(found.objective, 4.0, atol=1e-4)
+
+
+def test_non_convex_and_conditional_constraints_are_kept(truth):
+    A = np.random.default_rng(1).normal(size=(8, 20))
+    hull = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    constraints = [
+        com_in_hull(0, hull),
+        com_in_cylinder(1, [0, 0, -0.1], [0, 0, 0.1], 0.03),
+        when(lambda links: links.mass[0] > links.mass[1], lambda links: links.com[1, 2]),
+        # outside a sphere: not convex
+        lambda links: jnp.sum(links.com[0] ** 2) - 0.03**2,
+        mass_in_ellipsoid(1, [0, 0, 0], [0.3, 0.3, 0.3]),
+    ]
+    found = solve(A, A @ truth.ravel(), boxes(2), constraints=constraints, starts=32)
+    kept = found.phi[found.violation == 0]
+    assert len(kept) > 16
+    mass, com = kept[..., 0], kept[..., 1:4] / kept[..., :1]
+    assert np.all(com[:, 0] >= 0)
+    assert np.all(com[:, 0].sum(-1) <= 0.1)
+    assert np.all(np.linalg.norm(com[:, 1, :2], axis=-1) <= 0.03)
+    assert np.all((mass[:, 0] <= mass[:, 1]) | (com[:, 1, 2] >= 0))
+    assert np.all(np.linalg.norm(com[:, 0], axis=-1) >= 0.03)
+
+
+def test_what_cannot_be_met_is_reported_as_violated():
+    found = solve(np.eye(10)[:1], np.array([5.0]), boxes(1), constraints=[lambda l: l.mass - 11.0], starts=4)
+    np.testing.assert_allclose(found.violation, 1.0, atol=1e-3)
+    assert not found.converged.any()
+
+
+def test_given_parameters_are_the_first_start(reachable, truth):
+    """What is given solves the problem already, so that no step can lower it much."""
+    found = reachable[-1]
+    np.testing.assert_allclose(found.phi[0], truth, atol=0.05)
+    assert np.abs(found.phi[1] - truth).max() > 0.05
+
+
+def test_the_triangle_margin_of_a_plate_is_zero_and_of_a_cube_is_not():
+    plate = Links(jnp.ones(1), jnp.zeros((1, 3)), jnp.diag(jnp.array([1.0, 2.0, 3.0]))[None])
+    cube = Links(jnp.ones(1), jnp.zeros((1, 3)), jnp.eye(3)[None])
+    np.testing.assert_allclose(triangle_inequality(plate), [0.0], atol=1e-15)
+    np.testing.assert_allclose(triangle_inequality(cube), [0.5])
+
+
+def test_margins_of_the_ready_made_constraints_are_distances():
+    links = Links(jnp.array([2.0]), jnp.array([[0.1, 0.0, 0.3]]), jnp.eye(3)[None])
+    np.testing.assert_allclose(total_mass(1.0, 5.0)(links), [1, 3])
+    np.testing.assert_allclose(
+        com_in_cylinder(0, [0, 0, 0], [0, 0, 1], 0.1)(links), [0.3, 0.7, 0], atol=1e-15
+    )
+    cube = [[x, y, z] for x in (0, 1) for y in (-1, 1) for z in (0, 1)]
+    assert np.min(com_in_hull(0, cube)(links)) == pytest.approx(0.1)
+    # The shell of an ellipsoid about its own centre: m - tr(D^-2 Sigma) is zero for Sigma = m D²/3.
+    D = np.array([0.1, 0.2, 0.3])
+    shell = Links(jnp.array([2.0]), jnp.zeros((1, 3)), inertia.inertia(jnp.diag(2 * D**2 / 3))[None])
+    np.testing.assert_allclose(mass_in_ellipsoid(0, [0, 0, 0], D)(shell), 0, atol=1e-14)
+
+
+def test_a_condition_that_does_not_hold_leaves_the_constraint_satisfied():
+    links = Links(jnp.array([2.0]), jnp.zeros((1, 3)), jnp.eye(3)[None])
+    light = when(lambda l: l.mass[0] < 1, lambda l: -l.mass)
+    heavy = when(lambda l: l.mass[0] > 1, lambda l: -l.mass)
+    assert np.all(light(links) >= 0)
+    np.testing.assert_allclose(heavy(links), [-2])
+
+
+def test_a_flat_hull_is_refused():
+    with pytest.raises(InputError, match="no volume"):
+        com_in_hull(0, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+
+
+def test_the_published_bounds_are_read_with_their_total_mass():
+    bounds = Bounds.panda()
+    assert bounds.dof == 7
+    np.testing.assert_allclose(bounds.com[6, 2], [0.04, 0.15])
+    np.testing.assert_allclose(bounds.total_mass, [16, 20])
+
+
+def test_bounds_around_an_arm_hold_that_arm():
+    arm = panda()
+    bounds = Bounds.around(arm)
+    mass, com, I_com = jax.vmap(inertia.to_com)(arm.standard)
+    six = I_com[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    for value, box in ((mass, bounds.mass), (com, bounds.com), (six, bounds.inertia)):
+        assert np.all((value >= box[..., 0]) & (value <= box[..., 1]))
+    assert bounds.total_mass[0] < mass.sum() < bounds.total_mass[1]
+
+
+GOOD = "name,lower,upper\nm1,0,5\nc1x,-1,1\nc1y,-1,1\nc1z,-1,1\n"
+
+
+def test_inertia_and_total_mass_may_be_absent_from_a_table(tmp_path):
+    (tmp_path / "b.csv").write_text(GOOD)
+    bounds = Bounds.from_csv(tmp_path / "b.csv")
+    assert bounds.total_mass is None
+    np.testing.assert_array_equal(bounds.inertia[0, :, 0], [0, 0, 0, -np.inf, -np.inf, -np.inf])
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (GOOD.replace("m1,0,5", "m1,0,heavy"), "row 2, column upper: 'heavy'"),
+        (GOOD.replace("m1,0,5", "m1,6,5"), r"m1: \[6, 5\] is empty"),
+        (GOOD.replace("m1,0,5", "m1,nan,5"), "bounds of m1"),
+        (GOOD.replace("m1,0,5", "m1,0,inf"), "must be finite"),
+        (GOOD.replace("m1,0,5", "mass1,0,5"), "row 2, column name: 'mass1'"),
+        (GOOD.replace("c1z,-1,1\n", ""), "no row for c1z"),
+        (GOOD + "m1,0,5\n", "row 6, column name: 'm1' occurs twice"),
+        (GOOD + "total_mass,7,8\n", "total_mass"),
+        (GOOD + "m3,0,1\n", "no row for m2"),
+        ("name;lower;upper\n", "no columns name,lower,upper"),
+        ("", "no columns"),
+    ],
+)
+def test_a_malformed_table_of_bounds_is_refused_by_row_and_column(tmp_path, text, complaint):
+    (tmp_path / "b.csv").write_text(text)
+    with pytest.raises(InputError, match=complaint):
+        Bounds.from_csv(tmp_path / "b.csv")
+
+
+def test_binary_garbage_is_no_table_of_bounds(tmp_path):
+    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x80" * 9)
+    with pytest.raises(InputError, match=r"b\.csv"):
+        Bounds.from_csv(tmp_path / "b.csv")
+
+
+@pytest.mark.parametrize(
+    ("A", "b", "complaint"),
+    [
+        (np.eye(9), np.ones(9), "fewer than the ten"),
+        (np.full((1, 10), np.nan), np.ones(1), "not finite"),
+    ],
+)
+def test_equations_that_make_no_sense_are_refused(A, b, complaint):
+    with pytest.raises(InputError, match=complaint):
+        solve(A, b, boxes(1))
