@@ -13,6 +13,7 @@ brings z onto the axis, with its origin at the joint's position.
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo's names come from a compiled module without stubs.
 import dataclasses
+import warnings
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -107,7 +108,10 @@ def from_document(document: markup.Document) -> tuple[Arm, MjcfSource]:
     """`from_mjcf` of a text that need not be on disk; names in it are relative to `document.path`."""
     spec = _parse(document)
     notes = _drop_looks(spec, document)
-    model = _compile(spec, document.path)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        model = _compile(spec, document.path)
+    notes += [f"MuJoCo warns: {warning.message}" for warning in said]
     joints, locked = _serial_joints(model, document.path)
     _check_joints(model, joints, document.path)
     notes += _notes(model, joints, locked)
@@ -143,13 +147,21 @@ def load_spec(path: str | Path) -> mujoco.MjSpec:
 
 
 def _parse(document: markup.Document) -> mujoco.MjSpec:
+    files = document.includes | _attached(document)
     try:
-        spec = mujoco.MjSpec.from_string(document.text, include=document.includes)
+        spec = mujoco.MjSpec.from_string(document.text, include=files)
     except ValueError as error:
         raise InputError(f"{document.path}: {_sentence(error)}") from None
     spec.modelfiledir = str(document.path.parent)
     spec.compiler.fusestatic = False  # the bodies stay those of the text; the mechanics are the same
     return spec
+
+
+def _attached(document: markup.Document) -> dict[str, bytes]:
+    """Other models that the file attaches parts of."""
+    names = [e.attributes.get("file", "") for e in document.root.walk() if e.tag == "model"]
+    files = {name: document.path.parent / name for name in names if name}
+    return {name: file.read_bytes() for name, file in files.items() if file.is_file()}
 
 
 def _compile(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
