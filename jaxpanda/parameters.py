@@ -173,7 +173,7 @@ def _listed_order(dof: int) -> list[int]:
     return [10 * link + k for tier in _LISTED for link in range(dof) for k in tier]
 
 
-def expression(terms: Mapping[str, float]) -> str:
+def expression(terms: Mapping[str, float | int]) -> str:
     """A linear form as text: inertias by kind, then single masses and moments, then masses that go together.
 
     Coefficients are printed to four decimals, as the paper does (five significant digits where that says less
@@ -226,7 +226,7 @@ def _index(name: str) -> int:
 
 
 def coefficient_matrix(
-    terms: Sequence[Mapping[str, Any]], dof: int | None = None, *, where: str = "coefficients"
+    terms: Sequence[Any], dof: int | None = None, *, where: str = "coefficients"
 ) -> Float[np.ndarray, "base standard"]:
     """K of a table of coefficients: row i holds the linear form `terms[i]`.
 

@@ -8,6 +8,7 @@ M is symmetric, so its upper triangle is stacked, once. Of the Panda this has ra
 References:
     Gaz et al., RA-L 2019, Sec. III-IV.
 """
+# pyright: reportAttributeAccessIssue=false
 
 import dataclasses
 from collections.abc import Callable
@@ -39,9 +40,9 @@ class MassGravity:
     name: str
     q: Float[np.ndarray, "sample dof"]
     """[rad]"""
-    M: Float[np.ndarray, "sample dof dof"] | None
+    M: Float[np.ndarray, "_ _ _"] | None
     """[kg m²]; None where only gravity is known."""
-    g: Float[np.ndarray, "sample dof"] | None
+    g: Float[np.ndarray, "_ _"] | None
     """[N m]; None where only the mass matrix is known."""
 
     def __post_init__(self):
@@ -75,7 +76,7 @@ def load_mass_gravity(path: str | Path) -> MassGravity:
     """
     path = Path(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             found = {name: np.asarray(file[name], float) for name in ("q", "M", "g") if name in file}
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or 'not an .npz file'})") from None

@@ -23,12 +23,13 @@ from ..parameters import Base, base_parameters
 from ..signals import Signals
 
 _CHUNK = 1024  # samples whose regressor is evaluated at once; bounds the memory
+_REST = 0.01  # [rad/s, m/s]: a joint that never exceeds it has not moved
 _REWEIGHTINGS = 2  # after the first, joint weights change by less than a percent
 _LEAST_SIGMA = 1e-9  # of the torque: below it a residual is round-off, as on noise-free data
 UNDETERMINED = 1e-9
 """Singular values of unit-length columns below this share of the largest tell nothing."""
 
-Masks = Sequence[Bool[np.ndarray, " time"]]
+Masks = Sequence[Bool[np.ndarray, "..."]]
 """Which samples of each recording to use."""
 
 
@@ -75,7 +76,7 @@ def regression(signals: Signals, arm: Arm, base: Base, friction: str) -> Regress
             for joint in range(arm.dof)
         ]
     )
-    own = signals.lowpass(np.asarray(columns(friction, qd)))
+    own = signals.lowpass(np.asarray(columns(friction, jnp.asarray(moving(signals)))))
     A = with_columns(rigid, np.moveaxis(own, 1, 0))
     for what, values in (("torque", tau), ("motion", A), ("torque of the model's own joint physics", known)):
         if not np.all(np.isfinite(values)):
@@ -83,6 +84,11 @@ def regression(signals: Signals, arm: Arm, base: Base, friction: str) -> Regress
                 f"{signals.name}: the filtered {what} is not finite; jaxpanda inspect shows where"
             )
     return Regression(signals.name, A, tau - known, tau, len(signals.keep) / signals.output_rate)
+
+
+def moving(signals: Signals) -> Float[np.ndarray, "time dof"]:
+    """Velocities [rad/s], zero for a joint that rests throughout: its encoder's noise is no motion."""
+    return np.where(np.max(np.abs(signals.qd), axis=0) > _REST, signals.qd, 0.0)
 
 
 def with_columns(

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from ..friction import sigmoid
 from ..signals import Signals
-from .regression import Masks, Regression, with_columns
+from .regression import Masks, Regression, moving, with_columns
 
 _STEEPNESS = (1.0, 300.0)  # [s/rad]: from a line over the whole range of speeds to a step
 _FIRST_STEEPNESS = 30.0  # [s/rad]
@@ -46,9 +46,9 @@ def _column(qd: Float[Array, ""], log_phi2: Float[Array, ""], phi3: Float[Array,
 
 def _columns(signals: Signals, unknowns: Float[np.ndarray, "2 dof"]) -> Float[np.ndarray, "3 dof time"]:
     """Filtered sigmoid columns, and their derivatives."""
-    shape = signals.qd.shape
-    a, b = (jnp.broadcast_to(jnp.asarray(row), shape) for row in unknowns)
-    return np.moveaxis(signals.lowpass(np.asarray(_column(jnp.asarray(signals.qd), a, b))), (2, 1), (0, 1))
+    qd = jnp.asarray(moving(signals))
+    a, b = (jnp.broadcast_to(jnp.asarray(row), qd.shape) for row in unknowns)
+    return np.moveaxis(signals.lowpass(np.asarray(_column(qd, a, b))), (2, 1), (0, 1))
 
 
 def with_shape(rigid: Sequence[Regression], signals: Sequence[Signals], shape: Shape) -> list[Regression]:
