@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-
 N = 7
 LIMITS = np.array(
     [
@@ -25,8 +24,8 @@ HOME = np.array([0.0, -0.785, 0.0, -2.2, 0.0, 1.6, 0.785])
 FLANGE = 0.107
 MAX_TORQUE = np.array([87, 87, 87, 87, 12, 12, 12])
 
-# Mass [kg], centre of mass [m] and inertia about it [kg m^2] (xx yy zz xy xz yz), along the link's frame; of the
-# size of Gaz et al., RA-L 2019, table of retrieved parameters.
+# Mass [kg], centre of mass [m] and inertia about it [kg m^2] (xx yy zz xy xz yz), along the link's frame;
+# of the size of Gaz et al., RA-L 2019, table of retrieved parameters.
 _MASS = np.array([4.9707, 0.6469, 3.2286, 3.5879, 1.2259, 1.6666, 0.7355])
 _COM = np.array(
     [
@@ -129,7 +128,7 @@ def _made_physical(body):
 
 
 def draw_arm(rng):
-    """An arm of the family: masses 4 %, centres 3 mm, inertias 5 %; some friction, armature or a gripper that is known."""
+    """An arm of the family: masses 4 %, centres 3 mm, inertias 5 %; known friction, armature, gripper."""
     links = tuple(
         _made_physical(
             Body(
@@ -168,7 +167,7 @@ def _inertial(body):
 
 
 def mjcf(arm, actuators=True):
-    """The arm as MJCF: plain motors for the user's file, none for a plant whose torque is applied from outside."""
+    """The arm as MJCF: plain motors for the user's file, none for a plant."""
     lines = [
         '<mujoco model="panda">',
         '  <compiler angle="radian"/>',
@@ -194,7 +193,7 @@ def mjcf(arm, actuators=True):
             lines += [
                 f'{indent}<body name="rotor" {place}>',
                 f'{indent}  <inertial mass="1e-6" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/>',
-                f'{indent}  <joint {joint} armature="{_text(arm.soft.rotor + arm.armature[j])}" limited="false"/>',
+                f'{indent}  <joint {joint} armature="{_text(arm.soft.rotor + arm.armature[j])}"/>',
             ]
             closing.append(f"{indent}</body>")
             indent += "  "
@@ -297,9 +296,9 @@ def regressor(arm, q, v, a):
 def identified(arm, rng, q, v, a, noise_std):
     """The arm as an identification from the motion (q, v, a) would leave it.
 
-    Draws the links' parameters from the Gaussian posterior of that identification: prior of the family's own spread, rows
-    of the motion with the noise of the torque sensors. Directions that the motion does not show stay as far from the truth as
-    the prior allows; the others end within a fraction of the noise.
+    Draws the links' parameters from the Gaussian posterior of that identification: prior of the family's own
+    spread, rows of the motion with the noise of the torque sensors. Directions that the motion does not show
+    stay as far from the truth as the prior allows; the others end within a fraction of the noise.
     """
     phi = np.concatenate([_standard(body) for body in arm.links])
     spread = np.concatenate(

@@ -1,7 +1,8 @@
 """One case: an arm, what is concealed in it, recordings as its sensors give them, and the answer.
 
-The plant is MuJoCo's C engine at 1 kHz in closed loop: the user's model as feed-forward, a spring and a damper about the wanted
-motion. Torque is what the actuators give, read by a sensor with noise. The effects act while the arm moves.
+The plant is MuJoCo's C engine at 1 kHz in closed loop: the user's model as feed-forward, a spring and a
+damper about the wanted motion. Torque is what the actuators give, read by a sensor with noise. The effects
+act while the arm moves.
 """
 
 import copy
@@ -10,26 +11,24 @@ import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import effects as catalogue
 import mujoco
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.signal import butter, filtfilt, lfilter
-
-import effects as catalogue
 from arm import HOME, N, draw_arm, identified, inverse_dynamics, mjcf
 from motions import FAMILIES, LEAD, STEP, desired
-
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, filtfilt, lfilter
 
 STRENGTH = {"weak": 1.5, "medium": 5.0, "strong": 15.0}
 EDGE = 0.3  # [s] at either end where a zero-phase filter has no past or future: not scored
 
 
-# ------------------------------------------------------------------------------------------------ the plant
+# -------------------------------------------------------------------------------- the plant
 
 
 @dataclass(frozen=True)
 class Run:
-    """What the arm really did: true positions, velocities, accelerations and joint torques on the grid of the simulation."""
+    """What the arm really did: q [rad], v [rad/s], a [rad/s^2], tau [N m] at the steps of the simulation."""
 
     t: np.ndarray
     q: np.ndarray
@@ -39,13 +38,14 @@ class Run:
 
 
 class Unstable(Exception):
-    """This draw is of no use: out of reach, off its motion, or chattering faster than any filter lets through."""
+    """This draw is of no use: out of reach, off its motion, or chattering faster than filters let through."""
 
 
 def _friction_law(model, dofs, concealed):
     """Slope, look-ahead and level of MuJoCo's friction constraint: torque = clip((a + b v) / R, +-level).
 
-    Joints with concealed friction get a transition of a few mrad/s of their own, for that of the engine depends on the inertia.
+    Joints with concealed friction get a transition of a few mrad/s of their own, for that of the engine
+    depends on the inertia.
     """
     for j, speed, level in concealed:
         dof = dofs[j]
@@ -173,7 +173,7 @@ class Plant:
         return total
 
     def inverse(self, t, q, v, a, still=False):
-        """Torque [N m] that the motion (true positions) takes; `still`: links settled against their sensors at once."""
+        """Torque [N m] that the motion (true positions) takes; `still`: a soft joint settles at once."""
         if self.soft is None:
             tau = self._rigid(t, q, v, a)
         else:
@@ -202,7 +202,7 @@ class Plant:
         return tau
 
     def _settled(self, t, q, v, a):
-        """Twist under the torque of the rigid arm, and nothing of its rates: all that survives a noisy motion."""
+        """Twist under the torque of the rigid arm, without its rates: all that survives a noisy motion."""
         smooth = butter(2, 2 * 6.0 * (t[1] - t[0]))
         return (self.soft.settled(filtfilt(*smooth, self._rigid(t, q, v, a)[:, self.soft.joints[0]])),)
 
@@ -253,7 +253,7 @@ class Plant:
         return tau
 
 
-# ------------------------------------------------------------------------------------------------ sensors
+# -------------------------------------------------------------------------------- sensors
 
 
 def draw_sensors(rng):
@@ -325,11 +325,11 @@ def write_csv(path, t, q, dq, tau=None):
     path.write_text(header + "\n" + "\n".join(row % tuple(values) for values in table.tolist()) + "\n")
 
 
-# ------------------------------------------------------------------------------------------------ the oracle
+# -------------------------------------------------------------------------------- the oracle
 
 
 def filtered(t, q, cutoff):
-    """Zero-phase positions, velocities and accelerations on a uniform grid, from stamps that need not be uniform."""
+    """Zero-phase positions, velocities and accelerations on a uniform grid, from whatever time stamps."""
     h = np.median(np.diff(t))
     grid = t[0] + h * np.arange(int((t[-1] - t[0]) / h) + 1)
     smooth = CubicSpline(t, q)(grid)
@@ -358,7 +358,7 @@ def prediction_rmse(plant, t, q, tau):
     return np.min(errors, axis=0)
 
 
-# ------------------------------------------------------------------------------------------------ a case
+# -------------------------------------------------------------------------------- a case
 
 
 @dataclass(frozen=True)
@@ -372,7 +372,7 @@ class Plan:
 
 
 def _strength(extra, noise_std, effect, active, step):
-    """RMS torque over noise while the effect acts: at each of its joints, or at the joint that shows a whole-arm effect most."""
+    """RMS torque over noise while the effect acts: at each of its joints, or at the joint that shows most."""
     if isinstance(effect, catalogue._Soft):  # what impacts add above 15 Hz is not what one calls its size
         extra = filtfilt(*butter(2, 2 * 15 * step), extra, axis=0)
     ratio = rmse(extra[active]) / noise_std
@@ -474,7 +474,7 @@ class Case:
             if not _compatible(effects):
                 continue
             if all(
-                self._scale(effect, STRENGTH.get(s, None) or float(s))
+                self._scale(effect, STRENGTH[s])
                 for effect, s in zip(effects, self.plan.strengths, strict=True)
             ):
                 return effects
@@ -532,7 +532,7 @@ class Case:
         return plant, run
 
     def _gains(self, model):
-        """Stiffness and damping that hold at 1 kHz in every pose: for the least inertia a joint shows (all axes parallel)."""
+        """Stiffness and damping that hold at 1 kHz in every pose: for the least inertia a joint shows."""
         inertia = np.minimum(1 / model.dof_invweight0, 0.2)
         omega = 60.0 if any(isinstance(e, catalogue._Soft) for e in self.effects) else 100.0
         return inertia * omega**2, 2 * inertia * omega
@@ -543,7 +543,7 @@ class Case:
         return Plant(self.arm, others, self.transition).read(run.t, seen_q, run.v, run.a)
 
     def simulate(self):
-        """Run every recording; scale once more where the closed loop made an effect larger or smaller than wanted."""
+        """Run every recording; scale again where the loop made an effect larger or smaller than wanted."""
         for attempt in range(4):
             runs = [self._simulate(k) for k in range(self.records)]
             worst = 0.0
@@ -561,7 +561,7 @@ class Case:
                 strength = _strength(extra, self.noise_std, effect, effect.active(part.t), 2 * STEP)
                 self.rms.append(rmse(extra[effect.active(part.t)]))
                 self.strengths.append(strength)
-                ratio = (STRENGTH.get(wanted, None) or float(wanted)) / np.maximum(strength, 1e-9)
+                ratio = STRENGTH[wanted] / np.maximum(strength, 1e-9)
                 worst = max(worst, float(np.max(np.abs(np.log(ratio)))))
                 effect._ratio = ratio
             if worst < 0.12 or attempt == 3:
@@ -572,7 +572,7 @@ class Case:
         self.held = self._simulate(self.records)
 
     def write(self, folder, slack=0.05):
-        """All files of the case; returns the truth. `slack`: how far an oracle may be off, as a share of the strength."""
+        """All files of the case; returns the truth. `slack`: how far the oracle may be off, by strength."""
         self.simulate()
         rng = np.random.default_rng([*self.seed, 1])
         plant, run = self.held

@@ -1,20 +1,19 @@
 """What is concealed: each effect as plain code of its own, at random joints and of random shape.
 
-An effect may change the plant (`plant`, `before`), act on the joints while they move (`level`: friction of Coulomb's kind, in
-N m; `force`: any other opposing torque; `wrench`: forces from outside), sit between motor and link (`twist`), or falsify what the
-sensors say (`observe`). `size` is scaled until the effect has the wanted strength. Joint numbers are 0-based here, 1-based in truth.json.
+An effect may change the plant (`plant`, `before`), act on the joints while they move (`level`: friction of
+Coulomb's kind, in N m; `force`: any other opposing torque; `wrench`: forces from outside), sit between motor
+and link (`twist`), or falsify what the sensors say (`observe`). `size` is scaled until the effect has the
+wanted strength. Joint numbers are 0-based here, 1-based in truth.json.
 
-The formulas are meant to differ in detail from those that a library of effects would hold: that is how it is on a real arm.
+The formulas are meant to differ in detail from those of a library of effects, as a real arm's do.
 """
 
 from dataclasses import replace
 
 import mujoco
 import numpy as np
+from arm import Body, N, SoftJoint
 from scipy.signal import lfilter
-
-from arm import N, Body, SoftJoint
-
 
 SHOULDER = (0, 1, 2, 3)
 BIG = np.array([1, 1, 1, 1, 0.4, 0.4, 0.4])
@@ -90,7 +89,7 @@ class Effect:
         ]
 
 
-# ------------------------------------------------------------------------------------------------ friction
+# -------------------------------------------------------------------------------- friction
 
 
 class Viscous(Effect):
@@ -208,7 +207,7 @@ class LoadDependent(Effect):
 
 
 class FrictionDrift(Effect):
-    """Coulomb and viscous friction that change while the joint warms up; the model knows the level it ends at."""
+    """Friction that changes while the joint warms up; the model knows one end of it."""
 
     name = "friction_drift"
 
@@ -283,7 +282,7 @@ class Presliding(Effect):
         )
 
 
-# ------------------------------------------------------------------------------------------------ transmission
+# -------------------------------------------------------------------------------- transmission
 
 
 class Ripple(Effect):
@@ -387,7 +386,7 @@ class Backlash(_Soft):
         return self.per_joint("gap", 2 * self.size, "rad")
 
 
-# ------------------------------------------------------------------------------------------------ inertia and load
+# -------------------------------------------------------------------------------- inertia and load
 
 
 class Armature(Effect):
@@ -539,7 +538,7 @@ class Spring(Effect):
         )
 
 
-# ------------------------------------------------------------------------------------------------ sensors
+# -------------------------------------------------------------------------------- sensors
 
 
 class Offset(Effect):
@@ -678,7 +677,7 @@ class Delay(Effect):
         return [("lag" if self.filter else "delay", 0, float(self.size[0]), "s")]
 
 
-# ------------------------------------------------------------------------------------------------ environment
+# -------------------------------------------------------------------------------- environment
 
 
 class Contact(Effect):
@@ -728,7 +727,7 @@ class Contact(Effect):
         ]
 
 
-# ------------------------------------------------------------------------------------------------ outside the catalogue
+# -------------------------------------------------------------------------------- outside the catalogue
 
 
 class Detent(Effect):

@@ -6,18 +6,16 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 import effects as catalogue
+import numpy as np
 from cases import Case, Plan, Unstable
-
 
 NASTY = ("", "narrow", "identified", "jitter", "friction", "clean")
 SHARES = {"strong": 0.22, "medium": 0.22, "weak": 0.12, "null": 0.2, "pair": 0.14, "outside": 0.1}
 
 
 def plans(seed, counts):
-    """The plan of every case. Effects come in shuffled order and all before any twice, so that small sets are even too."""
+    """The plan of every case. Effects come in shuffled order and all before any twice."""
     rng = np.random.default_rng([seed, 0])
     singles = {s: _cycle(rng, catalogue.CATALOGUE) for s in ("strong", "medium", "weak")}
     outside = _cycle(rng, catalogue.OUTSIDE)
@@ -59,7 +57,7 @@ def _pair(rng):
 
 
 def write_case(job):
-    """Write one case. A draw that is of no use is drawn again, then with more slack, then at less strength."""
+    """Write one case. A draw of no use is drawn again, then with more slack, then at less strength."""
     seed, index, plan, folder = job
     reason = None
     for attempt in range(24):
@@ -75,7 +73,7 @@ def write_case(job):
 
 def shares(count):
     """How many cases of each kind make `count`."""
-    counts = {name: int(round(share * count)) for name, share in SHARES.items()}
+    counts = {name: round(share * count) for name, share in SHARES.items()}
     counts["strong"] += count - sum(counts.values())
     return counts
 

@@ -1,9 +1,7 @@
-"""Motions that an arm's user would record: excitation, picking, slow and fast, small reversals, and too little."""
+"""Motions that a user would record: excitation, picking, slow and fast, small reversals, and too little."""
 
 import numpy as np
-
 from arm import HOME, LIMITS, N
-
 
 FAMILIES = ("fourier", "pick", "mixed", "micro")
 STEP = 0.001  # [s] of the simulation
@@ -74,7 +72,7 @@ def _micro(rng, t):
 
 
 def desired(rng, family, seconds):
-    """Joint positions [rad] at every step, from LEAD before the start to `seconds`, with their first two derivatives."""
+    """Joint positions [rad] at every step, from LEAD before the start to `seconds`, and two derivatives."""
     t = np.arange(-int(LEAD / STEP) - _MARGIN, int(seconds / STEP) + 1 + _MARGIN) * STEP
     if family == "fourier":
         q = _fourier(rng, t, rng.uniform(0.6, 1.6), _REACH)
