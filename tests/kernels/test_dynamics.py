@@ -300,7 +300,7 @@ def test_one_trace_serves_every_arm_of_a_shape():
 
 
 def test_inverse_dynamics_equals_mjx(mixed):
-    # its compilation takes seconds a joint; the Panda's is done once, where models are validated
+    # its compilation takes seconds a joint; the Panda's is in tests/test_validation.py (slow)
     from mujoco import mjx
 
     model = to_mujoco(*mixed)
