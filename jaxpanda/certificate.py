@@ -6,7 +6,9 @@ value no feasible set of links can be below.
 """
 
 import dataclasses
+import importlib
 import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +64,7 @@ def lower_bound(
         InputError: the solver finds no optimum, because nothing satisfies the bounds.
     """
     try:
-        import clarabel
+        clarabel: Any = importlib.import_module("clarabel")  # publishes no types
     except ImportError:
         raise MissingExtraError("the certificate of optimality", "sdp") from None
     began = time.perf_counter()

@@ -2,11 +2,13 @@
 
 import dataclasses
 import importlib.util
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import inertia
 from jaxtyping import Float
@@ -147,7 +149,7 @@ class Retrieval:
                 notes=tuple(document["notes"]),
                 solutions=_load_starts(file.with_name(STARTS_FILE)),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
             raise InputError(
                 f"{file}: field missing or malformed ({error}); `retrieve` writes it whole"
             ) from None
@@ -281,7 +283,7 @@ def _described(
 ) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape 6"]]:
     """Mass, centre of mass, and xx yy zz xy xz yz of the inertia about it."""
     flat = phi.reshape(-1, 10)
-    mass, com, I_com = (np.asarray(x) for x in jax.vmap(inertia.to_com)(flat))
+    mass, com, I_com = (np.asarray(x) for x in jax.vmap(inertia.to_com)(jnp.asarray(flat)))
     six = I_com[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     shape = phi.shape[:-1]
     return mass.reshape(shape), com.reshape(*shape, 3), six.reshape(*shape, 6)
@@ -315,10 +317,10 @@ def _margins(
 ) -> dict[str, Any]:
     """(value - lower, upper - value) of every box, the triangle inequality, and the user's margins."""
     mass, com, six = _described(phi)
-    I_com = np.asarray(jax.vmap(inertia.to_com)(phi)[2])
+    I_com = np.asarray(jax.vmap(inertia.to_com)(jnp.asarray(phi))[2])
     Sigma = 0.5 * np.trace(I_com, axis1=1, axis2=2)[:, None, None] * np.eye(3) - I_com
     pair = lambda value, box: [finite(value - box[0]), finite(box[1] - value)]
-    links = Links.from_phi(jax.numpy.asarray(phi))
+    links = Links.from_phi(jnp.asarray(phi))
     total = bounds.total_mass
     return {
         "triangle": np.linalg.eigvalsh(Sigma)[:, 0].tolist(),
@@ -368,6 +370,7 @@ def _load_starts(path: Path) -> Solutions | None:
     if not path.is_file():
         return None
     with np.load(path) as arrays:
-        fields = {name: arrays[name] for name in arrays.files}
-    seconds = {name: float(fields.pop(name)) for name in ("compile_seconds", "run_seconds")}
-    return Solutions(**fields, **seconds)
+        fields: dict[str, Any] = {name: arrays[name] for name in arrays.files}
+    for name in ("compile_seconds", "run_seconds"):
+        fields[name] = float(fields[name])
+    return Solutions(**fields)

@@ -6,7 +6,6 @@ Its kinks stall descent methods far from the optimum; `solver.solve` is what to 
 import time
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -74,11 +73,12 @@ def exact_penalty(
     )
     equations = (jnp.asarray(A), jnp.asarray(b), jnp.asarray(boxes))
     began = time.perf_counter()
-    run = _run_chunk.lower(problem, equations, keys[:chunk], steps, iterations).compile()
+    run = jax.jit(lambda keys: _run_chunk(problem, equations, keys, steps, iterations))
+    run = run.lower(keys[:chunk]).compile()
     compiled = time.perf_counter()
     chunks = []
     for first in range(0, starts, chunk):
-        chunks.append(jax.device_get(run(problem, equations, keys[first : first + chunk], steps, iterations)))
+        chunks.append(jax.device_get(run(keys[first : first + chunk])))
         if progress is not None:
             progress(min(first + chunk, starts), starts)
     phi, violation, converged, count = (np.concatenate(part)[:starts] for part in zip(*chunks, strict=True))
@@ -110,7 +110,6 @@ def _penalised(z: Float[Array, " p"], args: tuple) -> Float[Array, ""]:
     return jnp.sum((A @ links.phi.ravel() - b) ** 2) + xi * missed
 
 
-@eqx.filter_jit
 def _run_chunk(problem: Problem, equations: tuple, keys: Array, steps: int, iterations: int):
     boxes = equations[2]
 

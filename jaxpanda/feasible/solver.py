@@ -234,8 +234,8 @@ def scaled_problem(
 
 def _inset(box: Float[np.ndarray, "*shape 2"], by: float) -> Float[np.ndarray, "*shape 2"]:
     """The box moved inwards, at most by a quarter of its width."""
-    by = np.minimum(by, (box[..., 1] - box[..., 0]) / 4)
-    return np.stack([box[..., 0] + by, box[..., 1] - by], -1)
+    inset = np.minimum(by, (box[..., 1] - box[..., 0]) / 4)
+    return np.stack([box[..., 0] + inset, box[..., 1] - inset], -1)
 
 
 def _width(box: Float[np.ndarray, "*shape 2"]) -> Float[np.ndarray, "*shape"]:
