@@ -237,10 +237,14 @@ def _body_elements(source: MjcfSource) -> list[markup.Element]:
 
 def _agree(a: np.ndarray, b: np.ndarray, like: np.ndarray) -> bool:
     """Whether two sets of parameters of a body are the same to rounding in the dtype of `like`."""
-    precision = max(_SAME, 8 * float(np.finfo(like.dtype).eps))
+    precision = _precision(like)
     length = np.sqrt(np.abs(b[4:]).max() / b[0])
     scale = b[0] * np.concatenate([[1.0], np.full(3, length), np.full(6, length**2)])
     return bool(np.all(np.abs(a - b) <= precision * scale))
+
+
+def _precision(like: np.ndarray) -> float:
+    return max(_SAME, 8 * float(np.finfo(like.dtype).eps))
 
 
 def _inertial_edit(
@@ -368,7 +372,7 @@ def _verify(
     source: MjcfSource, edited: markup.Document, meant: np.ndarray, joints: Mapping[str, np.ndarray]
 ) -> None:
     """Compile what was written, and find what was meant and nothing else changed."""
-    arm, after = from_document(edited)
+    arm, after = from_document(edited, source.dropped)
     for i, link in enumerate(source.links):
         if not _agree(after.standard[i], meant[i], meant):
             raise InputError(
@@ -378,7 +382,7 @@ def _verify(
         for name, value in joints.items():
             got = np.asarray(getattr(arm, name))
             unused = name == "springref" and joints["stiffness"][i] == 0
-            if not unused and abs(got[i] - value[i]) > 1e-12 * abs(value[i]) + float(np.finfo(got.dtype).eps):
+            if not unused and abs(got[i] - value[i]) > _precision(got) * abs(value[i]):
                 raise InputError(
                     f"{source.path}: joint {link.joint!r} compiles to {name} {got[i]:.6g}, not"
                     f" {value[i]:.6g}; does springdamper, or a flag of <option>, decide it?"

@@ -63,6 +63,8 @@ class MjcfSource:
     document: markup.Document
     model: mujoco.MjModel
     """Compiled without the meshes that only give looks or contacts."""
+    dropped: frozenset[int]
+    """Geoms, by their place in the text, whose mesh was left out."""
     links: tuple[MjcfLink, ...]
     standard: Float[np.ndarray, "dof 10"]
     """Parameters of the links, what is lumped into them included, in float64 whatever JAX is set to."""
@@ -104,19 +106,26 @@ def from_mjcf(path: str | Path) -> tuple[Arm, MjcfSource]:
     return from_document(markup.read(path, "mujoco"))
 
 
-def from_document(document: markup.Document) -> tuple[Arm, MjcfSource]:
-    """`from_mjcf` of a text that need not be on disk; names in it are relative to `document.path`."""
+def from_document(document: markup.Document, dropped: frozenset[int] | None = None) -> tuple[Arm, MjcfSource]:
+    """`from_mjcf` of a text that need not be on disk; names in it are relative to `document.path`.
+
+    Args:
+        document: the text.
+        dropped: geoms whose mesh to leave out, as `MjcfSource` has them; else those without a say.
+    """
     spec = _parse(document)
-    notes = _drop_looks(spec, document)
+    dropped = _drop_looks(spec, document, dropped)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         model = _compile(spec, document.path)
-    notes += [f"MuJoCo warns: {warning.message}" for warning in said]
+    notes = [f"MuJoCo warns: {warning.message}" for warning in said]
+    if dropped:
+        notes.append(f"{len(dropped)} mesh geoms that give looks or contacts only were not read")
     joints, locked = _serial_joints(model, document.path)
     _check_joints(model, joints, document.path)
     notes += _notes(model, joints, locked)
     links, chain, standard = _links(model, joints)
-    source = MjcfSource(document, model, links, standard, bool(spec.compiler.degree), tuple(notes))
+    source = MjcfSource(document, model, dropped, links, standard, bool(spec.compiler.degree), tuple(notes))
     return _arm(model, links, chain, standard, spec.modelname or document.path.stem), source
 
 
@@ -178,22 +187,24 @@ def _sentence(error: ValueError) -> str:
     return f"MuJoCo refuses it: {head}" + (f" ({', '.join(rest)})" if rest else "")
 
 
-def _drop_looks(spec: mujoco.MjSpec, document: markup.Document) -> list[str]:
+def _drop_looks(
+    spec: mujoco.MjSpec, document: markup.Document, dropped: frozenset[int] | None = None
+) -> frozenset[int]:
     """Let no mesh, height field, skin or picture be read that has no say in the dynamics.
 
     A geom of such a mesh becomes a small sphere, so that whatever refers to it still can.
+    Returns the places of those geoms; `dropped` fixes them beforehand.
     """
     sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-    dropped = 0
-    for geom in spec.geoms:
-        if not (geom.meshname or geom.hfieldname):
-            continue
-        if _gives_inertia(spec, geom):
-            _check_mesh(spec, geom, document)
-            continue
+    if dropped is None:
+        shaped = [(i, geom) for i, geom in enumerate(spec.geoms) if geom.meshname or geom.hfieldname]
+        dropped = frozenset(i for i, geom in shaped if not _gives_inertia(spec, geom))
+        for i, geom in shaped:
+            if i not in dropped:
+                _check_mesh(spec, geom, document)
+    for geom in [geom for i, geom in enumerate(spec.geoms) if i in dropped]:
         geom.type, geom.meshname, geom.hfieldname = sphere, "", ""
         geom.size, geom.fromto = [0.01, 0, 0], np.full(6, np.nan)
-        dropped += 1
     for site in spec.sites:
         if site.meshname:
             site.type, site.meshname, site.size = sphere, "", [0.01, 0, 0]
@@ -203,15 +214,11 @@ def _drop_looks(spec: mujoco.MjSpec, document: markup.Document) -> list[str]:
         spec.delete(unused)
     for texture in spec.textures:
         if texture.builtin == mujoco.mjtBuiltin.mjBUILTIN_NONE:
-            texture.file, texture.builtin, texture.width, texture.height = (
-                "",
-                mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-                2,
-                2,
-            )
+            texture.file, texture.builtin = "", mujoco.mjtBuiltin.mjBUILTIN_FLAT
+            texture.width = texture.height = 2
             for i in range(len(texture.cubefiles)):
                 texture.cubefiles[i] = ""
-    return [f"{dropped} mesh geoms that give looks or contacts only were not read"] if dropped else []
+    return dropped
 
 
 def _gives_inertia(spec: mujoco.MjSpec, geom) -> bool:
@@ -221,9 +228,16 @@ def _gives_inertia(spec: mujoco.MjSpec, geom) -> bool:
     low, high = spec.compiler.inertiagrouprange
     weightless = geom.mass == 0 or (np.isnan(geom.mass) and geom.density == 0)
     explicit = geom.parent.explicitinertial and not always
-    return not (
-        geom.parent.name == "world" or explicit or never or weightless or not low <= geom.group <= high
-    )
+    return _moves(geom.parent) and not (explicit or never or weightless or not low <= geom.group <= high)
+
+
+def _moves(body) -> bool:
+    """Whether a joint stands between the body and the world; else its inertia is no matter."""
+    while body is not None:
+        if list(body.joints):
+            return True
+        body = body.parent
+    return False
 
 
 def _check_mesh(spec: mujoco.MjSpec, geom, document: markup.Document) -> None:

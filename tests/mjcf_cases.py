@@ -5,6 +5,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+
 from jaxpanda.mjcf import MjcfSource
 
 MODELS = Path(__file__).parent / "models"

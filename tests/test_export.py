@@ -190,6 +190,15 @@ def test_springs_are_written_in_the_units_of_the_file():
     np.testing.assert_allclose(written.stiffness, arm.stiffness + 1)
 
 
+def test_an_export_has_all_digits_where_jax_has_float32():
+    with jax.enable_x64(False):
+        arm, source = from_mjcf(MODELS / "odd_axes.xml")
+        assert write_parameters(source, arm, arm.standard).text == source.text
+        phi, friction = other_links(source), friction_of(6)
+        result = write_parameters(source, arm, phi, friction)
+    assert from_document(result.document)[1].standard == pytest.approx(phi, rel=1e-12, abs=1e-15)
+
+
 def test_an_arm_of_another_geometry_is_refused():
     _, source = from_mjcf(MODELS / "dm_like.xml")
     moved = eqx.tree_at(lambda a: a.chain.p, panda(), panda().chain.p.at[3, 0].add(0.01))
@@ -240,6 +249,19 @@ def test_an_included_file_takes_the_change_and_is_never_overwritten(tmp_path):
     assert not (tmp_path / "in" / "new.xml").exists()
     result.save(tmp_path / "out" / "new.xml")
     np.testing.assert_allclose(from_mjcf(tmp_path / "out" / "new.xml")[1].standard, phi, rtol=1e-12)
+
+
+def test_a_body_may_trade_the_inertia_of_its_mesh_for_a_written_one(tmp_path):
+    obj = "v 0 0 0\nv 0.1 0 0\nv 0 0.2 0\nv 0 0 0.3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "rock.obj").write_text(obj)
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco><asset><mesh file="rock.obj"/></asset><worldbody><body name="one">\n  <joint/>\n'
+        '  <geom type="mesh" mesh="rock"/>\n</body></worldbody></mujoco>\n'
+    )
+    arm, source = from_mjcf(tmp_path / "arm.xml")
+    result = write_parameters(source, arm, 2 * source.standard)
+    assert re.sub(r"\n  <inertial [^>]*/>", "", result.text) == source.text
+    np.testing.assert_allclose(from_document(result.document)[1].standard, 2 * source.standard, rtol=1e-12)
 
 
 def test_meshes_that_the_new_file_will_not_find_are_said(tmp_path):
@@ -324,6 +346,7 @@ def test_frictionloss_is_coulombs_law_with_the_solver_settings_written():
     assert np.all(friction_errors(stiff=True) < 0.01)
 
 
+@pytest.mark.slow
 def test_the_own_panda_runs_in_mjx():
     from mujoco import mjx
 

@@ -4,12 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxpanda_kernels import inertia
+from mjcf_cases import CASES, MODELS, chain_of, mujoco_torque, random_states
+
 from jaxpanda import mjcf
 from jaxpanda.errors import InputError
 from jaxpanda.mjcf import from_mjcf, load_model
 from jaxpanda.panda import panda
-from jaxpanda_kernels import inertia
-from mjcf_cases import CASES, MODELS, chain_of, mujoco_torque, random_states
 
 
 @pytest.mark.parametrize("path", CASES, ids=lambda path: path.stem)
@@ -217,3 +218,11 @@ def test_a_mesh_on_disk_still_gives_its_inertia(tmp_path):
 def test_a_compiled_model_keeps_every_geom_and_actuator_of_a_file_without_its_meshes():
     model = load_model(MODELS / "menagerie_like.xml")
     assert (model.ngeom, model.nu, model.nmesh) == (5, 4, 0)
+
+
+def test_a_fixed_base_may_lack_both_inertia_and_mesh(tmp_path):
+    base = '<body name="base"><geom type="mesh" mesh="m"/><frame pos="0 0 1"><body name="one">'
+    text = chain_of(HINGE, before='<asset><mesh name="m" file="m.stl"/></asset>')
+    text = text.replace('<body name="one">', base).replace("</worldbody>", "</frame></body></worldbody>")
+    (tmp_path / "arm.xml").write_text(text)
+    assert from_mjcf(tmp_path / "arm.xml")[0].dof == 2
