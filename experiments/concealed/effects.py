@@ -419,9 +419,6 @@ class Inertial(Effect):
         self.mass = rng.uniform(0.3, 1) * rng.choice([-1, 1])
         self.shift = rng.standard_normal(3) * 0.03
         self.swell = rng.uniform(0, 1)
-        body = arm.links[self.joints[0]]
-        while min(body.mass * (1 + self.mass * s) for s in (0.1, 0.7)) < 0.2 * body.mass:
-            self.mass = abs(self.mass)
 
     def plant(self, arm):
         links = list(arm.links)

@@ -30,7 +30,7 @@ WHOLE = {
     "external_contact",
 }
 EDGE = 0.3  # [s] at either end of the held-out motion that is not scored, as in truth.json
-STRENGTHS = ("strong", "medium", "weak")
+RATIOS = {"strong": 15.0, "medium": 5.0, "weak": 1.5}  # RMS of the effect over torque noise
 TARGETS = {
     "named right, strong": 0.95,
     "named right, medium": 0.90,
@@ -144,6 +144,12 @@ def gap_closed(truth, case, predicted):
     return share, float(np.max(reached / nominal))
 
 
+def strength(entry, noise_std):
+    """Name of the nearest strength of the trial, for sets whose truth does not say it."""
+    ratio = max(np.max(np.array(entry["rms_torque"]) / noise_std), 1e-9)
+    return min(RATIOS, key=lambda name: abs(np.log(RATIOS[name] / ratio)))
+
+
 def judge(case, out):
     """Everything that the figures need about one case."""
     truth = json.loads((case / "truth.json").read_text())
@@ -152,7 +158,7 @@ def judge(case, out):
     result = {
         "case": case.name,
         "stratum": truth.get("stratum", ("null", "single", "pair")[min(len(effects), 2)]),
-        "strengths": truth.get("strengths", []),
+        "strengths": truth.get("strengths") or [strength(entry, truth["noise_std"]) for entry in effects],
         "nasty": truth.get("nasty", ""),
         "family": truth["family"],
         "nominal": truth["nominal"],
@@ -213,15 +219,15 @@ def figures(results):
         name: [r for r in results if r["stratum"] == name] for name in ("single", "pair", "outside", "null")
     }
     table = {}
-    for strength in STRENGTHS:
-        some = [r for r in of["single"] if r["strengths"] == [strength]]
+    for size in RATIOS:
+        some = [r for r in of["single"] if r["strengths"] == [size]]
         named = [r["answer"][:1] == r["truth"] for r in some]
-        table[f"named right, {strength}"] = (_mean(named), len(named))
+        table[f"named right, {size}"] = (_mean(named), len(named))
         local = [r for r in some if r["truth"][0] not in WHOLE]
         exact = [
             bool(r["answer"]) and sorted(r["answer_joints"][0]) == sorted(r["truth_joints"][0]) for r in local
         ]
-        table[f"joints exact, {strength}"] = (_mean(exact), len(exact))
+        table[f"joints exact, {size}"] = (_mean(exact), len(exact))
     iou = [x for r in of["single"] + of["pair"] for x in r["iou"]]
     table["interval IoU, median"] = (float(np.median(iou)) if iou else None, len(iou))
     alarms = [bool(r["answer"]) or r["verdict"] != "consistent" for r in of["null"]]
