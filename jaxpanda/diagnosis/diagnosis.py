@@ -116,7 +116,7 @@ def diagnose(
     log: list[str] = []
     state = search(problem, log)
     found = tuple(findings(problem, state))
-    corrected = _corrected(arm, problem, state, spread)
+    corrected = _corrected(arm, problem, state, spread, knowledge)
     text, warnings = _corrected_xml(source, corrected)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
@@ -189,18 +189,12 @@ def _rms(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.sqrt(np.mean(stacked**2, 0)) if len(stacked) else np.zeros(stacked.shape[1])
 
 
-def _corrected(arm: Arm, problem: Problem, state: State, spread: np.ndarray) -> Corrected:
+def _corrected(
+    arm: Arm, problem: Problem, state: State, spread: np.ndarray, knowledge: knowledge_.Knowledge
+) -> Corrected:
     """The arm with the terms, and with what they leave of the nuisance; as it was where nothing was found."""
-    change, damping, level = np.zeros((arm.dof, 10)), np.zeros(arm.dof), np.zeros(arm.dof)
-    if state.terms:
-        x = state.design.x
-        change = (spread @ x[: spread.shape[1]]).reshape(arm.dof, 10)
-        k = spread.shape[1]
-        share = x[k : problem.nuisance[0].shape[2]]
-        held = [(damping, np.asarray(arm.damping)), (level, np.asarray(arm.frictionloss))]
-        places = [(out, j, value[j]) for out, value in held for j in np.flatnonzero(value > 0)]
-        for (out, j, value), one in zip(places, share, strict=False):
-            out[j] = one * value
+    x = state.design.x[: problem.nuisance[0].shape[2]] * (1.0 if state.terms else 0.0)
+    change, damping, level = knowledge_.changes(arm, x, spread, knowledge)
     return Corrected(
         arm,
         jnp.asarray(change),

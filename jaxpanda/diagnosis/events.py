@@ -139,7 +139,7 @@ def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal
 
 def _window_sums(sums, pairs):
     b, G, C = (x[pairs[:, 1]] - x[pairs[:, 0]] for x in sums)
-    return b, G - np.einsum("mpa,mpb->mab", C, C, optimize=True)
+    return b, G - np.matmul(np.swapaxes(C, 1, 2), C)
 
 
 def _event(effect, b, G, clock, pairs) -> Proposal:

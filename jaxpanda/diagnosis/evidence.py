@@ -90,25 +90,35 @@ class Design:
         rows, m, n = Phi.shape
         flat = Phi.reshape(rows, m * n)
         b = (flat.T @ (self.residual[joint] - self.columns[joint] @ self.x)).reshape(m, n)
-        G = np.einsum("tma,tmb->mab", Phi, Phi, optimize=True)
+        G = gram(Phi)
         if self.factor is not None:
-            C = scipy.linalg.solve_triangular(
-                self.factor[0], self.columns[joint].T @ flat, lower=True
-            ).reshape(-1, m, n)
-            G = G - np.einsum("pma,pmb->mab", C, C, optimize=True)
+            C = scipy.linalg.solve_triangular(self.factor[0], self.columns[joint].T @ flat, lower=True)
+            G = G - gram(C.reshape(-1, m, n))
         return b, G
 
     def in_arm(
-        self, Phi: Sequence[Float[np.ndarray, "rows n"]]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-        """b and G of one candidate that acts in all joints."""
-        n = Phi[0].shape[1]
-        b, G, C = np.zeros(n), np.zeros((n, n)), np.zeros((len(self.g), n))
+        self, Phi: Sequence[Float[np.ndarray, "rows m n"]]
+    ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n n"]]:
+        """b and G of m candidates that act in all joints."""
+        _, m, n = Phi[0].shape
+        b, G, C = np.zeros((m, n)), np.zeros((m, n, n)), np.zeros((len(self.g), m * n))
         for A, r, F in zip(self.columns, self.residual, Phi, strict=True):
-            b += F.T @ (r - A @ self.x)
-            G += F.T @ F
-            C += A.T @ F
-        return b, G - C.T @ self.solve(C)
+            if not F.any():
+                continue
+            flat = F.reshape(len(F), m * n)
+            b += (flat.T @ (r - A @ self.x)).reshape(m, n)
+            G += gram(F)
+            C += A.T @ flat
+        if self.factor is not None:
+            C = scipy.linalg.solve_triangular(self.factor[0], C, lower=True)
+            G = G - gram(C.reshape(-1, m, n))
+        return b, G
+
+
+def gram(F: Float[np.ndarray, "rows m n"]) -> Float[np.ndarray, "m n n"]:
+    """$F_m^\\top F_m$ of each m."""
+    stacked = np.moveaxis(F, 1, 0)
+    return np.matmul(np.swapaxes(stacked, 1, 2), stacked)
 
 
 def log_bayes(

@@ -84,3 +84,18 @@ def nuisance(
             parts.append((level[j] * sign)[:, :, None] * joints[:, j : j + 1])
         out.append(np.concatenate(parts, 2))
     return out
+
+
+def changes(
+    arm: Arm, x: Float[np.ndarray, " columns"], spread: Float[np.ndarray, "standard n"], knowledge: Knowledge
+) -> tuple[Float[np.ndarray, "dof 10"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
+    """What coefficients x of `nuisance` mean: changes of standard parameters, damping and frictionloss."""
+    inertial = spread.shape[1]
+    out = [(spread @ x[:inertial]).reshape(arm.dof, 10)]
+    done = inertial
+    for value in (np.asarray(arm.damping), np.asarray(arm.frictionloss)):
+        change, here = np.zeros(arm.dof), np.flatnonzero(_FRICTION[knowledge] * value > 0)
+        change[here] = _FRICTION[knowledge] * value[here] * x[done : done + len(here)]
+        done += len(here)
+        out.append(change)
+    return out[0], out[1], out[2]

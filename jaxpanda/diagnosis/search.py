@@ -19,9 +19,12 @@ ACCEPT = 9.0
 """Evidence that an effect needs, its search over shapes paid for [nats]."""
 SWAP = 3.0
 """Evidence that another effect must win by to take an accepted one's place [nats]."""
-MOST_TERMS = 8
-_REFINED = 8
-_ROUNDS = 5
+SHADOW = 0.004
+"""Share of the strongest term's evidence below which others are taken for its shadows: for what its shape, which is
+never quite right, leaves over."""
+MOST_TERMS = 5
+_REFINED = 7
+_ROUNDS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,12 +50,13 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
 def search(problem: Problem, log: list[str] | None = None) -> State:
     """Add the likeliest effect while one has evidence; then see if another does better in an earlier one's place."""
     say = log.append if log is not None else (lambda _: None)
-    state = start(problem)
+    state, strongest = start(problem), 0.0
     while len(state.terms) < MOST_TERMS:
         proposals = ranked(problem, state.design, state.noise)
         say(f"{len(state.terms)} terms: " + describe(proposals[:6]))
-        if not proposals or proposals[0].evidence < ACCEPT:
+        if not proposals or proposals[0].evidence < max(ACCEPT, SHADOW * strongest):
             break
+        strongest = max(strongest, proposals[0].evidence)
         state = with_terms(problem, (*state.terms, problem.term(proposals[0].effect, proposals[0].deviation)))
         state = swap(problem, state, say)
     return prune(problem, state, say)
@@ -83,7 +87,7 @@ def prune(problem: Problem, state: State, say: Any) -> State:
     while state.terms:
         gains = [gain(problem, state, i) for i in range(len(state.terms))]
         weakest = int(np.argmin(gains))
-        floor = max(ACCEPT, 0.01 * max(gains))
+        floor = max(ACCEPT, SHADOW * max(gains))
         if gains[weakest] >= floor:
             break
         say(f"prune {state.terms[weakest].key}: {gains[weakest]:.1f}")
@@ -114,37 +118,17 @@ def ranked(problem: Problem, design: Design, noise: Noise) -> list[Proposal]:
         if p.key not in best or p.evidence > best[p.key].evidence:
             best[p.key] = p
     order = sorted(best.values(), key=lambda p: -p.evidence)
-    refined = [refine(problem, design, noise, p) for p in order[:_REFINED]]
-    return sorted([*refined, *order[_REFINED:]], key=lambda p: -p.evidence)
+    close = sum(p.evidence > max(0.4 * order[0].evidence, 4.0) for p in order[:_REFINED])
+    refined = [refine(problem, design, noise, p) for p in order[:close]]
+    return sorted([*refined, *order[close:]], key=lambda p: -p.evidence)
 
 
 def grids(problem: Problem, design: Design, noise: Noise) -> list[Proposal]:
     """The catalogue's grids: for each effect and place, the likeliest shape and the evidence over all."""
     scores: dict[tuple, list] = defaultdict(list)
     for group in problem.library:
-        coefficients = group.effects[0].coefficients
-        signs = np.array([k.sign for k in coefficients])
-        if group.joint is not None:
-            j = group.joint
-            Phi = problem.whitened(group.columns, noise, j)
-            b, G = design.in_joint(j, Phi)
-            deviation = _deviation(coefficients, np.concatenate(group.columns), noise.std[j])
-        else:
-            parts = [
-                design.in_arm(
-                    [
-                        problem.whitened([c[:, j, m] for c in group.columns], noise, j)
-                        for j in range(problem.dof)
-                    ]
-                )
-                for m in range(len(group.effects))
-            ]
-            b, G = np.stack([p[0] for p in parts]), np.stack([p[1] for p in parts])
-            deviation = _deviation(
-                coefficients, np.concatenate(group.columns) / noise.std[:, None, None], 1.0
-            )
-        score, scale = log_bayes(b, G, deviation, _scales(coefficients), signs)
-        scores[group.name, group.effects[0].joints].append((group, score, scale, deviation))
+        value, scale, deviation = _score(problem, design, noise, group.effects, group.columns)
+        scores[group.name, group.effects[0].joints].append((group, value, scale, deviation))
     out = []
     for parts in scores.values():
         everything = np.concatenate([score for _, score, _, _ in parts])
@@ -188,27 +172,27 @@ def score(
     problem: Problem, design: Design, noise: Noise, effects: Sequence[AbstractEffect]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
     """Evidence of single shapes of one form at one place, and their prior deviations."""
-    coefficients = effects[0].coefficients
-    signs = np.array([k.sign for k in coefficients])
     columns = []
     for trace, on in zip(problem.traces, problem.active, strict=True):
-        x = columns_of(effects, trace)
-        columns.append(x if on and acts_in(effects[0], trace) else np.zeros_like(x))
+        here = on and acts_in(effects[0], trace)
+        columns.append(columns_of(effects, trace) * (1.0 if here else 0.0))
+    value, scale, deviation = _score(problem, design, noise, effects, columns)
+    return value, deviation * scale[:, None]
+
+
+def _score(problem: Problem, design: Design, noise: Noise, effects, columns):
+    """Evidence, likeliest scale, and prior deviations before the scale."""
+    coefficients = effects[0].coefficients
+    signs = np.array([k.sign for k in coefficients])
     if isinstance(effects[0], AbstractJointEffect):
         j = effects[0].joints[0]
         b, G = design.in_joint(j, problem.whitened(columns, noise, j))
         deviation = _deviation(coefficients, np.concatenate(columns), noise.std[j])
     else:
-        parts = [
-            design.in_arm(
-                [problem.whitened([c[:, j, m] for c in columns], noise, j) for j in range(problem.dof)]
-            )
-            for m in range(len(effects))
-        ]
-        b, G = np.stack([p[0] for p in parts]), np.stack([p[1] for p in parts])
+        b, G = design.in_arm([problem.whitened([c[:, j] for c in columns], noise, j) for j in range(problem.dof)])
         deviation = _deviation(coefficients, np.concatenate(columns) / noise.std[:, None, None], 1.0)
     value, scale = log_bayes(b, G, deviation, _scales(coefficients), signs)
-    return value, deviation * scale[:, None]
+    return value, scale, deviation
 
 
 def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> Proposal:

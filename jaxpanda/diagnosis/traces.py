@@ -26,6 +26,8 @@ POSITION_CUTOFF = 12.0
 """Low-pass of q before it is differentiated, at most [Hz]."""
 _LEAST_CUTOFF = 5.0
 _TRIM = 0.4
+_PARABOLA = 0.12
+"""At the ends of a recording, over which q is taken for a parabola to continue it [s]."""
 _SOLREF, _IMPEDANCE_LEAST, _IMPEDANCE_MOST = 0.02, 0.9, 0.95
 """MuJoCo's defaults for the constraint that frictionloss is: time constant [s], impedance at rest and beyond."""
 
@@ -82,7 +84,7 @@ def prepare(
     )
     if noise is None and rough.tau is not None:
         noise = signals_.white_noise(rough.tau)
-    q, qd, qdd = signals_.derivatives(position, position_cutoff(position, noise, arm, rate), rate)
+    q, qd, qdd = _derivatives(position, position_cutoff(position, noise, arm, rate), rate)
 
     thinnest = max(1, int(rate / FINE_RATE + 1e-6))
     keep = np.arange(0, len(time), thinnest) if whole else rough.keep
@@ -106,6 +108,19 @@ def prepare(
     channels = Channels(time[fine], q[fine], qd[fine], qdd[fine], load, load + held_fine)
     weight = (_distance(recording.time, time[keep]) < 2.5 / rate).astype(float)
     return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff)
+
+
+def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):
+    """`signals.derivatives`, with q continued beyond its ends as parabolas: an arm may be cut off in motion."""
+    count = min(max(8, round(_PARABOLA * rate)), len(q))
+    more = max(4, round(0.4 * rate))
+    x = np.arange(count) / rate
+    ends = []
+    for part, at in ((q[:count], -np.arange(more, 0, -1) / rate), (q[-count:], x[-1] + np.arange(1, more + 1) / rate)):
+        fitted = np.polynomial.polynomial.polyfit(x, part, 2)
+        ends.append(np.polynomial.polynomial.polyval(at, fitted).T)
+    longer = signals_.derivatives(np.concatenate([ends[0], q, ends[1]]), cutoff, rate)
+    return tuple(part[more:-more] for part in longer)
 
 
 def _distance(
