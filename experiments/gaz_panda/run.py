@@ -95,7 +95,7 @@ def classical_set(signals: Signals, arm: Arm) -> tuple[np.ndarray, np.ndarray]:
 def as_printed(arm: Arm) -> Arm:
     """The Panda with c6z as Table VIII prints it."""
     mass, com, I_com = inertia.to_com(arm.standard[5])
-    printed = com.at[2].set(published()["links"][5]["com"][2])
+    printed = com.at[2].set(published()["retrieved_links"][5]["com"][2])
     phi = arm.standard.at[5].set(inertia.from_com(mass, printed, I_com))
     return dataclasses.replace(arm, standard=phi)
 
