@@ -82,6 +82,8 @@ def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, fl
     for proposal in ranked(problem, design, state.noise):
         name = proposal.effect.name
         by_name[name] = max(by_name.get(name, -np.inf), proposal.evidence)
+    if term.effect.name == "unknown":  # it has met its margin already
+        by_name["unknown"] = max(by_name.get("unknown", -np.inf), evidence)
     names = list(by_name)
     weights = np.array([by_name[n] for n in names] + [ACCEPT - 4.0]) / TEMPERATURE
     posterior = np.exp(weights - scipy.special.logsumexp(weights))
@@ -144,7 +146,7 @@ def _finding(problem: Problem, state: State, places: Sequence[int], rivals: Sequ
         parameters=tuple(parameters),
         rms_torque=rms,
         evidence=float(sum(rivals[i][0] for i in places)),
-        summary=_summary(effect.name, joints, rms, intervals, names, alternatives, problem, own),
+        summary=_summary(effect.name, joints, rms, intervals, names, alternatives, problem, own, '; '.join(equations)),
         terms=tuple(places),
     )
 
@@ -163,9 +165,14 @@ def _intervals(problem: Problem, terms: Sequence[Term]) -> tuple[tuple[float, fl
     return tuple(joined)
 
 
-def _summary(name, joints, rms, intervals, recordings, alternatives, problem, own) -> str:
+def _summary(name, joints, rms, intervals, recordings, alternatives, problem, own, equation) -> str:
     """One or two plain sentences."""
     strongest = int(np.argmax(rms))
+    if name == "unknown":
+        return (
+            f"Joint {strongest + 1} shows {rms[strongest]:.3g} N·m rms that no effect in the catalogue explains; it is"
+            f" fitted as a free curve ({equation.split(': ')[-1]})."
+        )
     where = "" if len(joints) in (0, problem.dof) else f" at joint{'s' * (len(joints) > 1)} {_listed(joints)}"
     when = ""
     if intervals is not None:

@@ -120,7 +120,7 @@ def diagnose(
     text, warnings = _corrected_xml(source, corrected)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
-        verdict="explained" if found else "consistent",
+        verdict=_verdict([f.effect for f in found]),
         findings=found,
         fit=fit(problem, state),
         corrected=corrected,
@@ -187,6 +187,14 @@ def held_out(problem: Problem, state: State) -> list[tuple[np.ndarray, np.ndarra
 def _rms(parts: Sequence[np.ndarray]) -> np.ndarray:
     stacked = np.concatenate(list(parts))
     return np.sqrt(np.mean(stacked**2, 0)) if len(stacked) else np.zeros(stacked.shape[1])
+
+
+def _verdict(names: Sequence[str]) -> str:
+    if not names:
+        return "consistent"
+    if "unknown" not in names:
+        return "explained"
+    return "unexplained" if set(names) == {"unknown"} else "partly_explained"
 
 
 def _corrected(

@@ -52,21 +52,16 @@ def ripple(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal]
         orders = np.arange(max(2.5, 1.5 * step), highest, step)
         if not len(orders):
             continue
-        Phi = np.concatenate(
-            [
-                problem.whitened(
-                    [
-                        np.stack([np.sin(x[:, None] * part), np.cos(x[:, None] * part)], 2) * on
-                        for x, on in zip(q, problem.active, strict=True)
-                    ],
-                    noise,
-                    j,
-                )
-                for part in np.array_split(orders, 1 + len(orders) // 200)
+        Phi, G = problem.prepared(
+            ("ripple",),
+            lambda q=q, orders=orders: [
+                np.stack([np.sin(x[:, None] * orders), np.cos(x[:, None] * orders)], 2) * on
+                for x, on in zip(q, problem.active, strict=True)
             ],
-            1,
+            noise,
+            j,
         )
-        b, G = design.in_joint(j, Phi)
+        b, G = design.in_joint(j, Phi, G)
         deviation = np.full((len(orders), 2), noise.std[j] * np.sqrt(2))
         score, scale = log_bayes(b, G, deviation, SCALES)
         top = int(score.argmax())

@@ -84,30 +84,29 @@ class Design:
         return float(0.5 * self.g @ self.x - half_determinant + 0.5 * np.log(self.precision).sum())
 
     def in_joint(
-        self, joint: int, Phi: Float[np.ndarray, "rows m n"]
+        self, joint: int, Phi: Float[np.ndarray, "rows m n"], G: Float[np.ndarray, "m n n"]
     ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n n"]]:
-        """b and G of m candidates that act in one joint."""
+        """b and G of m candidates that act in one joint, given their Gram matrices."""
         rows, m, n = Phi.shape
         flat = Phi.reshape(rows, m * n)
         b = (flat.T @ (self.residual[joint] - self.columns[joint] @ self.x)).reshape(m, n)
-        G = gram(Phi)
         if self.factor is not None:
             C = scipy.linalg.solve_triangular(self.factor[0], self.columns[joint].T @ flat, lower=True)
             G = G - gram(C.reshape(-1, m, n))
         return b, G
 
     def in_arm(
-        self, Phi: Sequence[Float[np.ndarray, "rows m n"]]
+        self, Phi: Sequence[Float[np.ndarray, "rows m n"]], grams: Sequence[Float[np.ndarray, "m n n"]]
     ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n n"]]:
-        """b and G of m candidates that act in all joints."""
+        """b and G of m candidates that act in all joints, given their Gram matrices in each."""
         _, m, n = Phi[0].shape
         b, G, C = np.zeros((m, n)), np.zeros((m, n, n)), np.zeros((len(self.g), m * n))
-        for A, r, F in zip(self.columns, self.residual, Phi, strict=True):
-            if not F.any():
+        for A, r, F, Q in zip(self.columns, self.residual, Phi, grams, strict=True):
+            if not Q.any():
                 continue
             flat = F.reshape(len(F), m * n)
             b += (flat.T @ (r - A @ self.x)).reshape(m, n)
-            G += gram(F)
+            G += Q
             C += A.T @ flat
         if self.factor is not None:
             C = scipy.linalg.solve_triangular(self.factor[0], C, lower=True)

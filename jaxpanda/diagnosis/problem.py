@@ -3,12 +3,14 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractArmEffect, AbstractEffect, AbstractJointEffect
-from .evidence import Design, Noise
+from . import catchall
+from .evidence import Design, Noise, gram
 from .library import Candidates, build, columns_of
 from .noise import estimate
 from .traces import Trace
@@ -57,6 +59,15 @@ class Problem:
             out.append(dataclasses.replace(c, columns=columns))
         return out
 
+    @functools.cached_property
+    def catchalls(self) -> list[Candidates]:
+        """Free forms on these recordings; zero in those of reference."""
+        out = []
+        for c in catchall.build(self.traces):
+            columns = tuple(x if on else np.zeros_like(x) for x, on in zip(c.columns, self.active, strict=True))
+            out.append(dataclasses.replace(c, columns=columns))
+        return out
+
     def term(self, effect: AbstractEffect, deviation: Float[np.ndarray, " n"]) -> Term:
         """The effect's columns in all recordings."""
         return Term(effect, tuple(self.full_columns([effect])), deviation)
@@ -82,6 +93,26 @@ class Problem:
             w = trace.weight.reshape(-1, *[1] * (x.ndim - 1))
             parts.append(noise.whiten(x, joint) * w)
         return np.concatenate(parts)
+
+    @functools.cached_property
+    def _cache(self) -> dict:
+        return {}
+
+    def prepared(self, key: tuple, make: Any, noise: Noise, joint: int) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened columns `(rows, m, n)` in a joint and their Gram matrices, kept while the joint's noise stays.
+
+        Args:
+            key: names the columns.
+            make: gives them for each recording, `(time, m, n)`.
+            noise: to whiten by.
+            joint: where.
+        """
+        stamp = noise.a[joint].tobytes(), float(noise.sigma[joint])
+        kept = self._cache.get((key, joint))
+        if kept is None or kept[0] != stamp:
+            Phi = self.whitened(make(), noise, joint)
+            kept = self._cache[key, joint] = (stamp, Phi, gram(Phi))
+        return kept[1], kept[2]
 
     def design(self, terms: Sequence[Term], noise: Noise) -> Design:
         """The model with these terms, whitened."""

@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractJointEffect
 from .events import Proposal, ripple, windows
-from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
-from .library import columns_of
+from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, gram, log_bayes
+from .library import Candidates, columns_of
 from .problem import Problem, Term, acts_in
 
 ACCEPT = 9.0
@@ -22,6 +22,8 @@ SWAP = 3.0
 SHADOW = 0.004
 """Share of the strongest term's evidence below which others are taken for its shadows: for what its shape, which is
 never quite right, leaves over."""
+UNKNOWN_MARGIN, UNKNOWN_SHARE = 10.0, 0.06
+"""What a free form must win by [nats, share]."""
 MOST_TERMS = 5
 _REFINED = 7
 _ROUNDS = 4
@@ -58,8 +60,24 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
             break
         strongest = max(strongest, proposals[0].evidence)
         state = with_terms(problem, (*state.terms, problem.term(proposals[0].effect, proposals[0].deviation)))
-        state = swap(problem, state, say)
-    return prune(problem, state, say)
+    return contest(problem, prune(problem, swap(problem, prune(problem, state, say), say), say), say)
+
+
+def contest(problem: Problem, state: State, say: Any) -> State:
+    """At joints that took two named terms and more, see if one free form does better than all of them."""
+    for joint in range(problem.dof):
+        here = [t for t in state.terms if t.effect.joints == (joint,) and t.effect.name != "unknown"]
+        if len(here) < 2:
+            continue
+        others = [t for t in state.terms if all(t is not h for h in here)]
+        design = problem.design(others, state.noise)
+        gained = state.design.log_evidence - design.log_evidence
+        at_joint = [c for c in problem.catchalls if c.joint == joint]
+        best = max((*grids(problem, design, state.noise, at_joint),), key=lambda p: p.best)
+        say(f"joint {joint + 1}: {len(here)} terms {gained:.1f}, free form {best.best:.1f}: {best.effect.equation}")
+        if best.best > gained:
+            state = with_terms(problem, (*others, problem.term(best.effect, best.deviation)))
+    return state
 
 
 def swap(problem: Problem, state: State, say: Any) -> State:
@@ -107,9 +125,13 @@ def describe(proposals: Sequence[Proposal]) -> str:
 
 
 def ranked(problem: Problem, design: Design, noise: Noise) -> list[Proposal]:
-    """What each effect at each place would bring, the best of them refined; most evidence first."""
+    """What each effect at each place would bring, the best of them refined; most evidence first.
+
+    A free form must beat the best named effect by a margin, since no named law is quite the real one.
+    """
     proposals = [
-        *grids(problem, design, noise),
+        *(handicapped(p) for p in grids(problem, design, noise, problem.catchalls)),
+        *grids(problem, design, noise, problem.library),
         *ripple(problem, design, noise),
         *windows(problem, design, noise),
     ]
@@ -123,11 +145,17 @@ def ranked(problem: Problem, design: Design, noise: Noise) -> list[Proposal]:
     return sorted([*refined, *order[close:]], key=lambda p: -p.evidence)
 
 
-def grids(problem: Problem, design: Design, noise: Noise) -> list[Proposal]:
-    """The catalogue's grids: for each effect and place, the likeliest shape and the evidence over all."""
+def handicapped(proposal: Proposal) -> Proposal:
+    """A free form with its margin taken off."""
+    margin = max(UNKNOWN_MARGIN, UNKNOWN_SHARE * proposal.evidence)
+    return dataclasses.replace(proposal, evidence=proposal.evidence - margin)
+
+
+def grids(problem: Problem, design: Design, noise: Noise, groups: Sequence[Candidates]) -> list[Proposal]:
+    """For each effect and place in a library, the likeliest shape and the evidence over all."""
     scores: dict[tuple, list] = defaultdict(list)
-    for group in problem.library:
-        value, scale, deviation = _score(problem, design, noise, group.effects, group.columns)
+    for group in groups:
+        value, scale, deviation = _score(problem, design, noise, group.effects, group.columns, (id(group),))
         scores[group.name, group.effects[0].joints].append((group, value, scale, deviation))
     out = []
     for parts in scores.values():
@@ -180,16 +208,24 @@ def score(
     return value, deviation * scale[:, None]
 
 
-def _score(problem: Problem, design: Design, noise: Noise, effects, columns):
-    """Evidence, likeliest scale, and prior deviations before the scale."""
+def _score(problem: Problem, design: Design, noise: Noise, effects, columns, key=None):
+    """Evidence, likeliest scale, and prior deviations before the scale; `key` names columns that come again."""
     coefficients = effects[0].coefficients
     signs = np.array([k.sign for k in coefficients])
+
+    def prepared(j, make):
+        if key is not None:
+            return problem.prepared(key, make, noise, j)
+        Phi = problem.whitened(make(), noise, j)
+        return Phi, gram(Phi)
+
     if isinstance(effects[0], AbstractJointEffect):
         j = effects[0].joints[0]
-        b, G = design.in_joint(j, problem.whitened(columns, noise, j))
+        b, G = design.in_joint(j, *prepared(j, lambda: columns))
         deviation = _deviation(coefficients, np.concatenate(columns), noise.std[j])
     else:
-        b, G = design.in_arm([problem.whitened([c[:, j] for c in columns], noise, j) for j in range(problem.dof)])
+        parts = [prepared(j, lambda j=j: [c[:, j] for c in columns]) for j in range(problem.dof)]
+        b, G = design.in_arm([p[0] for p in parts], [p[1] for p in parts])
         deviation = _deviation(coefficients, np.concatenate(columns) / noise.std[:, None, None], 1.0)
     value, scale = log_bayes(b, G, deviation, _scales(coefficients), signs)
     return value, scale, deviation

@@ -1,6 +1,6 @@
 """The catalogue of physics beyond rigid bodies: one class an effect, one file a family."""
 
-from . import contact, drive, friction, load, memory, sensing
+from . import contact, drive, friction, load, memory, sensing, unknown
 from .effect import AbstractArmEffect as AbstractArmEffect
 from .effect import AbstractEffect as AbstractEffect
 from .effect import AbstractInstantEffect as AbstractInstantEffect
@@ -19,4 +19,5 @@ CATALOGUE = (
     *load.EFFECTS,
     *sensing.EFFECTS,
     *contact.EFFECTS,
+    *unknown.EFFECTS,
 )

@@ -1,0 +1,55 @@
+"""Free-form hypotheses for each joint: what competes with the catalogue, so that it need not be believed blindly."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..effects.unknown import FORMS, Unknown
+from .library import Candidates, columns_of
+from .traces import Trace
+
+
+_KNOTS = {"odd in dq": 8, "even in dq": 8, "of q": 10, "of t": 10, "friction of q": 9, "friction of t": 6}
+_FEW = 6
+_KINDS = {
+    "odd in dq": lambda m, j: np.abs(m.qd[:, j]),
+    "even in dq": lambda m, j: np.abs(m.qd[:, j]),
+    "of q": lambda m, j: m.q[:, j],
+    "of load": lambda m, j: m.load[:, j],
+    "of t": lambda m, j: m.time,
+    "friction of q": lambda m, j: m.q[:, j],
+    "friction of load": lambda m, j: np.abs(m.load[:, j]),
+    "friction of t": lambda m, j: m.time,
+    "of ddq": lambda m, j: m.qdd[:, j],
+    "of q_k": lambda m, j: m.q[:, j],
+    "odd in dq_k": lambda m, j: np.abs(m.qd[:, j]),
+}
+
+
+def build(traces: Sequence[Trace]) -> list[Candidates]:
+    """Every free form at every joint, with knots where the recordings have been."""
+    dof = traces[0].motion.dof
+    out = []
+    for form in FORMS:
+        effects = []
+        for j in range(dof):
+            for k in range(dof) if form.endswith("_k") else (j,):
+                knots = _knots(form, np.concatenate([_KINDS[form](t.motion, k) for t in traces]))
+                if (k != j or not form.endswith("_k")) and len(knots) > 2:
+                    effects.append(Unknown(j, k, tuple(knots.tolist()), form))
+        for count in {len(e.knots) for e in effects}:
+            same = [e for e in effects if len(e.knots) == count]
+            columns = [columns_of(same, trace) for trace in traces]
+            for i, effect in enumerate(same):
+                out.append(Candidates((effect,), effect.joints[0], tuple(c[:, i : i + 1] for c in columns)))
+    return out
+
+
+def _knots(form: str, x: np.ndarray) -> np.ndarray:
+    """Half by the range, half by where the samples are."""
+    count = _KNOTS.get(form, _FEW)
+    share = np.linspace(0, 1, count)
+    low, high = np.quantile(x, (0.005, 0.995))
+    if high - low < 1e-6:
+        return np.zeros(0)
+    return 0.5 * (low + share * (high - low)) + 0.5 * np.quantile(x, 0.005 + 0.99 * share)

@@ -1,0 +1,104 @@
+"""What no named effect explains: a free function of one channel, so that it is still located, described and fitted."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..arm import Arm
+from .effect import AbstractInstantEffect, Coefficient, smooth_sign
+from .motion import Channels, Joint
+
+
+_WIDTH = 0.01
+FORMS = {
+    "odd in dq": "an odd function of the joint's velocity",
+    "even in dq": "an even function of the joint's velocity",
+    "of q": "a function of the joint's position",
+    "of load": "a function of the joint's load",
+    "of t": "a function of time",
+    "friction of q": "friction that depends on the joint's position",
+    "friction of load": "friction that depends on the joint's load",
+    "friction of t": "friction that depends on time",
+    "of ddq": "a function of the joint's acceleration",
+    "of q_k": "a function of another joint's position",
+    "odd in dq_k": "an odd function of another joint's velocity",
+}
+"""What the free function may depend on."""
+
+
+class Unknown(AbstractInstantEffect):
+    r"""Structure that nothing named explains: $\tau_j = f(x)$ or $\tau_j = \tanh(\dot q_j/v_0)\,f(x)$.
+
+    f is piecewise linear, with a coefficient for its value at each knot; beyond the outermost knots it is
+    constant. `source` is the joint whose channel x is.
+    """
+
+    name: ClassVar[str] = "unknown"
+    reveals: ClassVar[str] = "single-joint motions that vary the channel it depends on and nothing else"
+
+    joint: Joint
+    source: Joint
+    knots: Float[Array, " n"] | tuple[float, ...]
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["Unknown"]:
+        return []  # its knots depend on the recordings
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"value_at_knot_{k + 1}", "N·m") for k in range(np.shape(self.knots)[-1]))
+
+    @property
+    def equation(self) -> str:
+        k = int(self.source) + 1
+        x = {
+            "odd in dq": "|dq|",
+            "even in dq": "|dq|",
+            "of load": "tau_load",
+            "friction of load": "|tau_load|",
+            "of q_k": f"q_{k}",
+            "odd in dq_k": f"|dq_{k}|",
+        }.get(self.form, self.form.split()[-1])
+        sign = {"odd in dq_k": f"sign(dq_{k}) * "}.get(self.form, "sign(dq) * " if self._odd else "")
+        return f"tau = {sign}f({x}), piecewise linear: {FORMS[self.form]}"
+
+    @property
+    def _odd(self) -> bool:
+        return self.form.startswith("friction") or self.form.startswith("odd")
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        qd = s.qd[self.joint]
+        x = {
+            "odd in dq": jnp.abs(qd),
+            "even in dq": jnp.abs(qd),
+            "of q": s.q[self.joint],
+            "of load": s.load[self.joint],
+            "of t": s.t,
+            "friction of q": s.q[self.joint],
+            "friction of load": jnp.abs(s.load[self.joint]),
+            "friction of t": s.t,
+            "of ddq": s.qdd[self.joint],
+            "of q_k": s.q[self.source],
+            "odd in dq_k": jnp.abs(s.qd[self.source]),
+        }[self.form]
+        knots = jnp.asarray(self.knots)
+        hats = jax.vmap(lambda e: jnp.interp(x, knots, e))(jnp.eye(knots.shape[0]))
+        if not self._odd:
+            return hats
+        return hats * smooth_sign(s.qd[self.source] if self.form == "odd in dq_k" else qd, _WIDTH)
+
+    def parameters(self, c, covariance):
+        knots = [
+            {"name": f"knot_{k + 1}", "joint": int(self.joint) + 1, "value": float(x), "std": None, "unit": "-"}
+            for k, x in enumerate(np.asarray(self.knots))
+        ]
+        return super().parameters(c, covariance) + knots
+
+
+EFFECTS = (Unknown,)
