@@ -71,7 +71,7 @@ class Plant:
         for effect in effects:
             arm = effect.plant(arm)
         self.arm = arm
-        self.soft = next((e for e in effects if isinstance(e, catalogue._Soft)), None)
+        self.soft = next((e for e in effects if isinstance(e, catalogue.Soft)), None)
         self.model = mujoco.MjModel.from_xml_string(mjcf(arm, actuators=False))
         self.model.opt.disableflags |= (
             mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_LIMIT
@@ -373,14 +373,14 @@ class Plan:
 
 def _strength(extra, noise_std, effect, active, step):
     """RMS torque over noise while the effect acts: at each of its joints, or at the joint that shows most."""
-    if isinstance(effect, catalogue._Soft):  # what impacts add above 15 Hz is not what one calls its size
+    if isinstance(effect, catalogue.Soft):  # what impacts add above 15 Hz is not what one calls its size
         extra = filtfilt(*butter(2, 2 * 15 * step), extra, axis=0)
     ratio = rmse(extra[active]) / noise_std
     return ratio[list(effect.joints)] if effect.local else np.max(ratio, keepdims=True)
 
 
 def _compatible(effects):
-    soft = sum(isinstance(e, catalogue._Soft) for e in effects)
+    soft = sum(isinstance(e, catalogue.Soft) for e in effects)
     loads = sum(isinstance(e, catalogue.Payload) for e in effects)
     body = sum(isinstance(e, (catalogue.Payload, catalogue.Inertial)) for e in effects)
     timed = sum(e.interval is not None for e in effects)
@@ -534,7 +534,7 @@ class Case:
     def _gains(self, model):
         """Stiffness and damping that hold at 1 kHz in every pose: for the least inertia a joint shows."""
         inertia = np.minimum(1 / model.dof_invweight0, 0.2)
-        omega = 60.0 if any(isinstance(e, catalogue._Soft) for e in self.effects) else 100.0
+        omega = 60.0 if any(isinstance(e, catalogue.Soft) for e in self.effects) else 100.0
         return inertia * omega**2, 2 * inertia * omega
 
     def _without(self, effect, k, run, seen_q):
@@ -546,9 +546,7 @@ class Case:
         """Run every recording; scale again where the loop made an effect larger or smaller than wanted."""
         for attempt in range(4):
             runs = [self._simulate(k) for k in range(self.records)]
-            worst = 0.0
-            self.rms = []
-            self.strengths = []
+            self.rms, self.strengths, factors = [], [], []
             for effect, wanted in zip(self.effects, self.plan.strengths, strict=True):
                 record = self.records - 1 if effect.interval is not None else 0
                 plant, run = runs[record]
@@ -561,13 +559,11 @@ class Case:
                 strength = _strength(extra, self.noise_std, effect, effect.active(part.t), 2 * STEP)
                 self.rms.append(rmse(extra[effect.active(part.t)]))
                 self.strengths.append(strength)
-                ratio = STRENGTH[wanted] / np.maximum(strength, 1e-9)
-                worst = max(worst, float(np.max(np.abs(np.log(ratio)))))
-                effect._ratio = ratio
-            if worst < 0.12 or attempt == 3:
+                factors.append(STRENGTH[wanted] / np.maximum(strength, 1e-9))
+            if attempt == 3 or all(np.all(np.abs(np.log(factor)) < 0.12) for factor in factors):
                 break
-            for effect in self.effects:
-                effect.resize(np.clip(effect._ratio, 0.3, 3))
+            for effect, factor in zip(self.effects, factors, strict=True):
+                effect.resize(np.clip(factor, 0.3, 3))
         self.runs = runs
         self.held = self._simulate(self.records)
 

@@ -317,7 +317,7 @@ class Ripple(Effect):
         )
 
 
-class _Soft(Effect):
+class Soft(Effect):
     """Sensor and link joined by a law of their own: a hinge more in the plant."""
 
     def plant(self, arm):
@@ -332,7 +332,7 @@ class _Soft(Effect):
         raise NotImplementedError
 
 
-class Elasticity(_Soft):
+class Elasticity(Soft):
     """Two masses and a spring that stiffens a little."""
 
     name = "joint_elasticity"
@@ -362,7 +362,7 @@ class Elasticity(_Soft):
         return self.per_joint("stiffness", 1 / self.size, "N·m/rad")
 
 
-class Backlash(_Soft):
+class Backlash(Soft):
     """A gap of `2 size` [rad] between stiff stops."""
 
     name = "backlash"
