@@ -73,6 +73,12 @@ class Corrected(eqx.Module):
         )
 
     @property
+    def as_written(self) -> "Corrected":
+        """The same effects on the user's own numbers."""
+        zeros = (jnp.zeros_like(self.change), jnp.zeros_like(self.damping_change), jnp.zeros_like(self.damping_change))
+        return eqx.tree_at(lambda c: (c.change, c.damping_change, c.frictionloss_change), self, zeros)
+
+    @property
     def beyond(self) -> tuple[tuple[AbstractEffect, Float[Array, " _n"]], ...]:
         """Effects that act on the plant and that MuJoCo's attributes do not hold, with their coefficients."""
         out = []

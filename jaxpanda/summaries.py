@@ -88,7 +88,9 @@ def retrieval(links: Any) -> Sequence[Section]:
         f"total mass {document['total_mass']:.2f} kg."
     ]
     if document["lower_bound"] is not None:
-        sentences.append(f"No feasible links can do better than {document['lower_bound']:.6g} (convex certificate).")
+        sentences.append(
+            f"No feasible links can do better than {document['lower_bound']:.6g} (convex certificate)."
+        )
     seconds = document["seconds"]
     sentences.append(f"{seconds['compile']:.1f} s to compile, {seconds['run']:.1f} s to run.")
     rows = [
@@ -105,7 +107,13 @@ def retrieval(links: Any) -> Sequence[Section]:
         Section(
             "Retrieval of feasible links",
             sentences,
-            [Table(heads, rows, "In each link's modified Denavit-Hartenberg frame; inertia about the centre of mass [kg m²]")],
+            [
+                Table(
+                    heads,
+                    rows,
+                    "In each link's modified Denavit-Hartenberg frame; inertia about the centre of mass [kg m²]",
+                )
+            ],
         )
     ]
 
@@ -114,7 +122,13 @@ def export(written: Any) -> Sequence[Section]:
     """What an export changed."""
     sentences = [f"Wrote {written.path}.", *written.warnings]
     rows = [
-        [f"{change.file}:{change.line}", change.element, change.attribute, change.old or "–", change.new or "–"]
+        [
+            f"{change.file}:{change.line}",
+            change.element,
+            change.attribute,
+            change.old or "–",
+            change.new or "–",
+        ]
         for change in written.changes
     ]
     tables = [Table(["where", "element", "attribute", "was", "is"], rows)] if rows else []
@@ -144,7 +158,11 @@ def _by_joint(caption: str, names: Sequence[str], columns: Mapping[str, Any]) ->
 
 
 def _repairs(repairs: Mapping[str, int]) -> list[str]:
-    return ["In the data: " + "; ".join(f"{what}: {count}" for what, count in repairs.items()) + "."] if repairs else []
+    return (
+        ["In the data: " + "; ".join(f"{what}: {count}" for what, count in repairs.items()) + "."]
+        if repairs
+        else []
+    )
 
 
 def torque_figure(
@@ -196,5 +214,7 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Retrieval": retrieval,
     "Export": export,
     "Validation": validation,
+    "Diagnosis": lambda result: [Section("Diagnosis", result.lines())],
+    "Prediction": lambda result: [Section("Prediction", result.lines())],
     "Demonstration": lambda result: result.sections,
 }

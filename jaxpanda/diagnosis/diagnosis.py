@@ -10,13 +10,13 @@ import numpy as np
 import scipy.interpolate
 from jaxtyping import Float
 
-from .. import files
+from .. import files, markup
 from .. import signals as signals_
 from ..arm import Arm
 from ..corrected import SCHEMA, Corrected
 from ..errors import InputError, require_x64
-from ..export import export_mjcf, write_parameters
-from ..mjcf import MjcfSource, from_mjcf
+from ..export import export_mjcf, panda_mjcf, write_parameters
+from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, load
 from . import knowledge as knowledge_
 from .decide import Finding, coefficients, findings
@@ -70,6 +70,16 @@ class Diagnosis:
             "log": list(self.log),
         }
 
+    def lines(self) -> list[str]:
+        """Verdict and findings in plain sentences."""
+        sentence = {
+            "consistent": "The simulation agrees with the recordings: what differs is within noise.",
+            "explained": "The simulation is missing physics that explains the difference.",
+            "partly_explained": "The simulation is missing physics, and part of the difference stays unexplained.",
+            "unexplained": "The simulation differs from the recordings in a way that no named effect explains.",
+        }[self.verdict]
+        return [sentence, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]
+
     def save(self, folder: str | Path) -> None:
         """Write diagnosis.json, corrected.xml and corrected.json; all or nothing."""
         with files.output_folder(folder) as scratch:
@@ -82,7 +92,7 @@ class Diagnosis:
 
 
 def diagnose(
-    model: str | Path,
+    model: str | Path | None,
     recordings: Sequence[str | Path | Recording],
     *,
     reference: Sequence[str | Path | Recording] = (),
@@ -91,7 +101,7 @@ def diagnose(
     """Say which physics a simulation is missing.
 
     Args:
-        model: the simulation (MJCF) as the user has it.
+        model: the simulation (MJCF) as the user has it; None for the project's own Panda.
         recordings: of the arm, with torque.
         reference: recordings of the same arm from when nothing was wrong; what they show is not reported.
         knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` says what the words mean.
@@ -101,7 +111,10 @@ def diagnose(
     """
     require_x64("a diagnosis")
     knowledge_.check(knowledge)
-    arm, source = from_mjcf(model)
+    if model is None:
+        arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", Path("panda.xml")))
+    else:
+        arm, source = from_mjcf(model)
     if not recordings:
         raise InputError("no recording: a diagnosis needs at least one")
     traces, active = [], []
@@ -214,10 +227,13 @@ def _corrected(
 
 
 def _corrected_xml(source: MjcfSource, corrected: Corrected) -> tuple[str, tuple[str, ...]]:
-    """The user's file with what MuJoCo holds natively put in, and what could not be."""
+    """The user's file with what MuJoCo holds natively put in, and what could not be.
+
+    Numbers that only moved within what they were uncertain by stay as the user wrote them.
+    """
     if not corrected.effects:
         return source.text, ()
-    native = corrected.native
+    native = corrected.as_written.native
     moved = any(hasattr(e, "standard_change") for e in corrected.effects)
     warnings: list[str] = []
     arm = Arm(

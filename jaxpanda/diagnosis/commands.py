@@ -1,0 +1,60 @@
+"""The commands `diagnose` and `predict`: between files and files."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..files import write_text
+from ..recordings import load, load_many
+from .diagnosis import Diagnosis, diagnose, predict
+from .knowledge import Knowledge
+
+
+@dataclasses.dataclass(frozen=True)
+class Prediction:
+    """Torque of a motion, and where it was written."""
+
+    path: Path
+    rows: int
+    rms: tuple[float, ...]
+    """Of each joint's torque [N m]."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "schema": "jaxpanda.prediction/1",
+            "path": str(self.path),
+            "rows": self.rows,
+            "rms": list(self.rms),
+        }
+
+    def lines(self) -> list[str]:
+        return [f"{self.rows} rows of torque in {self.path}."]
+
+
+def diagnose_files(
+    out: Path,
+    model: Path | None,
+    recordings: Sequence[Path],
+    reference: Sequence[Path],
+    knowledge: Knowledge,
+) -> Diagnosis:
+    """`jaxpanda diagnose`."""
+    if not recordings:
+        raise InputError("--recording: none given; name at least one file or folder")
+    found = diagnose(model, load_many(recordings), reference=load_many(reference), knowledge=knowledge)
+    found.save(out)
+    return found
+
+
+def predict_files(diagnosis: Path, recording: Path, out: Path) -> Prediction:
+    """`jaxpanda predict`."""
+    motion = load(recording)
+    tau = predict(diagnosis, motion)
+    head = ",".join(["time", *(f"tau_{j + 1}" for j in range(tau.shape[1]))])
+    table = np.column_stack([motion.time, tau]).tolist()
+    write_text(out, "\n".join([head, *(",".join(map(repr, row)) for row in table)]) + "\n")
+    return Prediction(out, len(tau), tuple(float(v) for v in np.sqrt(np.mean(tau**2, 0))))
