@@ -8,6 +8,7 @@ Inertial parameters are arguments like any other. All of it can be differentiate
 """
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from jaxtyping import Array, Float
 from . import columns
 from .chain import Chain
 from .columns import Columns, Entry, Geometry, specialise
+from .scalars import Scalar
 from .staging import alone
 
 
@@ -32,18 +34,34 @@ def _geometry(chain: Chain | Geometry, *states: Float[Array, "*samples dof"]) ->
     return arm
 
 
-def _columns(*states: Float[Array, "*samples dof"]) -> list[list[Float[Array, " samples"]]]:
-    """One array a joint; apart from what follows, which would else read with a stride."""
-    return alone(lambda *x: [list(v.reshape(-1, v.shape[-1]).T) for v in x], *states)
+def _columns(x: Float[Array, "*samples dof"]) -> list[Float[Array, " filled"]]:
+    """An array for each joint, and a sample at rest where that makes their number odd.
+
+    XLA on GPUs lets each thread compute four samples, or two, where their number can be divided so;
+    kernels as long as these then run out of registers, in float64 at half the speed.
+    """
+
+    def transposed(x):
+        rows = x.reshape(-1, x.shape[-1])
+        return jnp.pad(rows, ((0, 1 - rows.shape[0] % 2), (0, 0))).T
+
+    return list(alone(transposed, x))
 
 
-def _samples(columns: Sequence[Float[Array, " samples"]], shape: tuple[int, ...]) -> Float[Array, "..."]:
-    """Columns side by side as the last axes of an array of `shape`."""
-    return jnp.stack(columns, -1).reshape(shape)
+def _samples(columns: Sequence[Float[Array, " filled"]], shape: tuple[int, ...]) -> Array:
+    """Columns side by side, less what `_columns` filled in, as the last axes of an array of `shape`."""
+    count = math.prod(shape) // len(columns)
+    return jnp.stack([c[:count] for c in columns], -1).reshape(shape)
 
 
-def _bodies(phi: Float[Array, "dof 10"], like: Float[Array, "*samples dof"]) -> list[list[Float[Array, ""]]]:
-    return [list(body) for body in phi.astype(like.dtype)]
+def _bodies(
+    arm: Geometry, phi: Float[Array, "dof 10"], like: Float[Array, "*samples dof"]
+) -> list[list[Scalar]]:
+    """Bodies that take the same torques, with floats for the zeros among their parameters."""
+    T = columns.regrouping(arm)
+    regrouped = jnp.matmul(T, phi.reshape(-1), precision=lax.Precision.HIGHEST).astype(like.dtype)
+    numbers = [value if row.any() else 0.0 for value, row in zip(regrouped, T, strict=True)]
+    return [numbers[i : i + 10] for i in range(0, len(numbers), 10)]
 
 
 def rnea(
@@ -71,18 +89,56 @@ def rnea(
 @functools.partial(jax.jit, static_argnums=0)
 def _rnea(arm: Geometry, phi, q, qd, qdd):
     kernel = functools.partial(columns.rnea, arm)
-    return _samples(alone(kernel, _bodies(phi, q), *_columns(q, qd, qdd)), q.shape)
+    return _samples(alone(kernel, _bodies(arm, phi, q), *map(_columns, (q, qd, qdd))), q.shape)
 
 
-def entries(arm: Geometry, q: Columns, qd: Columns, qdd: Columns) -> dict[Entry, Float[Array, "*samples"]]:
-    """As `columns.regressor`, in the parts that compile and run best on the platform."""
+def entries(
+    chain: Chain | Geometry, q: Columns, qd: Columns, qdd: Columns
+) -> dict[Entry, Float[Array, "*samples"]]:
+    """Entries of the regressor that are not zero for every motion, a column of samples each.
 
-    def staged(q, qd, qdd):
-        outward = alone(functools.partial(columns.joints, arm), q)
-        moving = alone(functools.partial(columns.motions, arm), outward, qd, qdd)
-        return alone(lambda o, m: columns.rows(arm, o, m, range(arm.dof), q[0]), outward, moving)
+    As `columns.regressor`, in programs that compile and run well: on a CPU one, joints, motions and rows
+    after each other; on a GPU several (outside `jit`), each of a few entries, from the states. There an odd
+    number of samples runs up to 1.7 times faster in float64, as `_columns` says.
 
-    return staged(list(q), list(qd), list(qdd))
+    Args:
+        chain: the arm, or what `specialise` made of it.
+        q: positions [rad or m], one column a joint.
+        qd: velocities.
+        qdd: accelerations.
+    """
+    arm = _geometry(chain)
+    states = list(q), list(qd), list(qdd)
+    if jax.default_backend() == "cpu":
+        return _staged(arm, *states)
+    every = [_some(arm, group, *states) for group in _groups(arm)]
+    return {entry: column for group in every for entry, column in group.items()}
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _staged(arm: Geometry, q, qd, qdd):
+    outward = alone(functools.partial(columns.joints, arm), q)
+    moving = alone(functools.partial(columns.motions, arm), outward, qd, qdd)
+    return alone(lambda o, m: columns.rows(arm, o, m, range(arm.dof), q[0]), outward, moving)
+
+
+@functools.cache
+def _groups(arm: Geometry) -> tuple[tuple[Entry, ...], ...]:
+    """Entries in groups small enough for a GPU's registers, neighbours of one link together."""
+    state = [jax.ShapeDtypeStruct((), jnp.float32)] * arm.dof
+    found = jax.eval_shape(functools.partial(columns.regressor, arm), state, state, state)
+    by_link = sorted(found, key=lambda entry: (entry[1], entry))
+    size = math.ceil(len(by_link) / math.ceil(len(by_link) / 51))
+    return tuple(tuple(by_link[i : i + size]) for i in range(0, len(by_link), size))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _some(arm: Geometry, group: tuple[Entry, ...], q, qd, qdd):
+    def chosen(q, qd, qdd):
+        Y = columns.regressor(arm, q, qd, qdd)
+        return {entry: Y[entry] for entry in group}
+
+    return alone(chosen, q, qd, qdd)
 
 
 def regressor(
@@ -104,8 +160,8 @@ def regressor(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _regressor(arm: Geometry, q, qd, qdd):
-    Y = entries(arm, *_columns(q, qd, qdd))
-    zero = jnp.zeros(q.size // arm.dof, q.dtype)
+    Y = entries(arm, *map(_columns, (q, qd, qdd)))
+    zero = jnp.zeros_like(next(iter(Y.values())))
     every = [Y.get((i, l, k), zero) for i in range(arm.dof) for l in range(arm.dof) for k in range(10)]
     return _samples(every, (*q.shape, arm.dof, 10))
 
@@ -123,8 +179,7 @@ def mass_matrix(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _mass_matrix(arm: Geometry, phi, q):
-    (angles,) = _columns(q)
-    M = alone(functools.partial(columns.mass_matrix, arm), _bodies(phi, q), angles)
+    M = alone(functools.partial(columns.mass_matrix, arm), _bodies(arm, phi, q), _columns(q))
     every = [M[min(i, j), max(i, j)] for i in range(arm.dof) for j in range(arm.dof)]
     return _samples(every, (*q.shape, arm.dof))
 
@@ -147,9 +202,9 @@ def forward_dynamics(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _forward_dynamics(arm: Geometry, phi, q, qd, tau, armature):
-    bodies = _bodies(phi, q)
+    bodies = _bodies(arm, phi, q)
     rotors = list(armature.astype(q.dtype))
-    angles, speeds, torques = _columns(q, qd, tau)
+    angles, speeds, torques = map(_columns, (q, qd, tau))
     M = alone(functools.partial(columns.mass_matrix, arm), bodies, angles)
     h = alone(lambda b, x, v: columns.rnea(arm, b, x, v, [0.0] * arm.dof), bodies, angles, speeds)
 
@@ -211,8 +266,8 @@ def _gram(arm: Geometry, chunk: int, *samples):
         filled = jnp.pad(x.reshape(count, dof), ((0, missing), (0, 0)))
         return filled.reshape(-1, chunk, dof).swapaxes(1, 2)
 
-    shapes = jax.eval_shape(lambda: entries(arm, *([jnp.zeros(1)] * dof for _ in range(3))))
-    unknowns = [[(l, k) for row, l, k in shapes if row == i] for i in range(dof)]
+    kept = sorted(entry for group in _groups(arm) for entry in group)
+    unknowns = [[(l, k) for row, l, k in kept if row == i] for i in range(dof)]
 
     def accumulate(sums, part):
         q, qd, qdd, weight, tau = part

@@ -1,0 +1,50 @@
+// Pinocchio on one core, one sample after the other: nanoseconds an evaluation of rnea and of the torque regressor.
+// Standard input: dof, gravity, then 9 + 3 + 10 numbers a joint (axes by rows, origin, dynamic parameters).
+#include <pinocchio/algorithm/regressor.hpp>
+#include <pinocchio/algorithm/rnea.hpp>
+
+#include <chrono>
+#include <cstdlib>
+#include <iostream>
+#include <vector>
+
+template <class F>
+double nanoseconds(int samples, F f) {
+  const auto start = std::chrono::steady_clock::now();
+  for (int i = 0; i < samples; ++i) f(i);
+  const std::chrono::duration<double, std::nano> spent = std::chrono::steady_clock::now() - start;
+  return spent.count() / samples;
+}
+
+int main(int, char** argv) {
+  namespace pin = pinocchio;
+  const int samples = std::atoi(argv[1]);
+  int dof;
+  Eigen::Vector3d gravity;
+  std::cin >> dof >> gravity[0] >> gravity[1] >> gravity[2];
+  pin::Model model;
+  model.gravity.linear() = gravity;
+  pin::JointIndex parent = 0;
+  for (int j = 0; j < dof; ++j) {
+    Eigen::Matrix3d R;
+    Eigen::Vector3d p;
+    Eigen::Matrix<double, 10, 1> phi;
+    for (int k = 0; k < 9; ++k) std::cin >> R(k / 3, k % 3);
+    for (int k = 0; k < 3; ++k) std::cin >> p[k];
+    for (int k = 0; k < 10; ++k) std::cin >> phi[k];
+    parent = model.addJoint(parent, pin::JointModelRZ(), pin::SE3(R, p), "joint" + std::to_string(j));
+    model.appendBodyToJoint(parent, pin::Inertia::FromDynamicParameters(phi), pin::SE3::Identity());
+  }
+  pin::Data data(model);
+  std::vector<Eigen::VectorXd> q, qd, qdd;
+  for (int i = 0; i < samples; ++i) {
+    q.push_back(3.0 * Eigen::VectorXd::Random(dof));
+    qd.push_back(2.0 * Eigen::VectorXd::Random(dof));
+    qdd.push_back(5.0 * Eigen::VectorXd::Random(dof));
+  }
+  double sum = 0;  // read and printed, so that nothing is left out
+  const double rnea = nanoseconds(samples, [&](int i) { sum += pin::rnea(model, data, q[i], qd[i], qdd[i])[0]; });
+  const double regressor = nanoseconds(
+      samples, [&](int i) { sum += pin::computeJointTorqueRegressor(model, data, q[i], qd[i], qdd[i])(0, 0); });
+  std::cout << rnea << " " << regressor << " " << sum << std::endl;
+}

@@ -1,0 +1,334 @@
+"""Cost of inverse dynamics and of the regressor: ours and what else a user could take, measured in one run.
+
+    python kernels/benchmarks/rnea.py                      # prints the table
+    python kernels/benchmarks/rnea.py --baseline           # and replaces the committed baseline
+    python kernels/benchmarks/rnea.py --gpu --batch 16777215     # ours on a GPU, and the plain definition
+
+One process for each number of cores, bound to them before anything starts; warm-up first; contenders take
+turns, so that a busy machine is unfair to all of them; results are waited for, on a GPU those of eight calls
+together. Figures are nanoseconds of wall time an evaluation, median and range over the rounds, and process
+time beside it, which other people's load inflates less.
+
+pinocchio from C++ and MuJoCo from C are built with g++ where it and their headers are found (`--include` adds
+a folder, for Eigen); what could not be measured is said.
+"""
+
+import argparse
+import functools
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from importlib import metadata, util
+from pathlib import Path
+
+HERE = Path(__file__).parent
+BASELINE = HERE / "rnea.json"
+PINOCCHIO_FLAGS = [
+    "-DBOOST_MPL_LIMIT_LIST_SIZE=30",
+    "-DBOOST_MPL_LIMIT_VECTOR_SIZE=30",
+    "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
+    "-DBOOST_FUSION_INVOKE_MAX_ARITY=12",
+]
+
+
+def build(source: str, target: Path, includes: list[str], flags: list[str], library: Path) -> str | None:
+    """Compile one C++ file against one library; the reason if that failed."""
+    command = ["g++", "-std=c++17", "-O3", "-march=native", "-DNDEBUG", str(HERE / source), "-o", str(target)]
+    command += [f"-I{i}" for i in includes] + flags
+    command += [str(library), f"-Wl,-rpath,{library.parent}", f"-Wl,-rpath-link,{library.parent}", "-pthread"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True)
+    except FileNotFoundError:
+        return "no g++ here"
+    if done.returncode == 0:
+        return None
+    return next((line for line in done.stderr.splitlines() if "error" in line), done.stderr[:200])
+
+
+def build_peers(folder: Path, extra: list[str]) -> dict[str, str]:
+    """The two C++ loops, where their headers are; the reason for each that is missing."""
+    reasons = {}
+    cmeel = next((Path(p) / "cmeel.prefix" for p in sys.path if (Path(p) / "cmeel.prefix").is_dir()), None)
+    if cmeel is None:
+        reasons["pinocchio C++"] = "no pinocchio headers here"
+    else:
+        includes = [*extra, str(cmeel / "include"), str(cmeel / "include/eigen3"), "/usr/include/eigen3"]
+        library = cmeel / "lib/libpinocchio_default.so"
+        if reason := build("pinocchio_loop.cc", folder / "pinocchio", includes, PINOCCHIO_FLAGS, library):
+            reasons["pinocchio C++"] = reason
+    spec = util.find_spec("mujoco")
+    if spec is None or spec.origin is None:
+        reasons["mujoco C"] = "no mujoco here"
+    else:
+        home = Path(spec.origin).parent
+        library = next(home.glob("libmujoco.so*"))
+        if reason := build("mujoco_loop.cc", folder / "mujoco", [str(home / "include")], [], library):
+            reasons["mujoco C"] = reason
+    return reasons
+
+
+Contender = Callable[[], tuple[float, float]]
+"""Runs once; nanoseconds an evaluation of wall time and of process time."""
+
+
+def timed(f: Callable[[], object], evaluations: int) -> Contender:
+    def run() -> tuple[float, float]:
+        wall, process = time.perf_counter_ns(), time.process_time_ns()
+        f()
+        return (time.perf_counter_ns() - wall) / evaluations, (time.process_time_ns() - process) / evaluations
+
+    return run
+
+
+def ours(batch: int, note: Callable[[str, float], None], all_forms: bool) -> dict[str, Contender]:
+    """Compile our kernels for the Panda; `note` is told the seconds each took."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    from jaxpanda_kernels import batched, columns, dynamics
+
+    from jaxpanda.panda import panda
+
+    jax.config.update("jax_enable_x64", True)
+    arm = panda()
+    geometry = columns.specialise(arm.chain)
+    bodies = columns.regrouped(geometry, [[float(v) for v in body] for body in arm.standard])
+    rng = np.random.default_rng(0)
+    cpu = jax.default_backend() == "cpu"
+    in_flight = 1 if cpu else 8
+    contenders = {}
+
+    def add(name: str, f: Callable, *arguments, evaluations: int = batch) -> None:
+        start = time.perf_counter()
+        jax.block_until_ready(f(*arguments))
+        note(name, time.perf_counter() - start)
+
+        def calls() -> None:
+            for _ in range(in_flight - 1):
+                f(*arguments)
+            jax.block_until_ready(f(*arguments))
+
+        contenders[name] = timed(calls, in_flight * evaluations)
+
+    torque = jax.jit(functools.partial(columns.rnea, geometry, bodies))
+    plain = jax.jit(jax.vmap(functools.partial(dynamics.rnea, arm.chain), (None, 0, 0, 0)))
+    for dtype in (jnp.float64, jnp.float32):
+        kind, phi = dtype.__name__, arm.standard.astype(dtype)
+        q, qd, qdd = (jnp.asarray(rng.uniform(-s, s, (batch, 7)), dtype) for s in (np.pi, 2, 5))
+        lists = [[jnp.array(x[:, i]) for i in range(7)] for x in (q, qd, qdd)]
+        add(f"rnea, columns, {kind}", torque, *lists)
+        add(f"regressor, columns, {kind}", functools.partial(batched.entries, geometry), *lists)
+        if all_forms:
+            add(f"rnea, any shape, {kind}", functools.partial(batched.rnea, geometry, phi), q, qd, qdd)
+            few = min(batch, 2000 if cpu else 2**22)
+            add(f"rnea, plain definition, {kind}", plain, phi, q[:few], qd[:few], qdd[:few], evaluations=few)
+    return contenders
+
+
+def pinocchio_loops(folder: Path) -> dict[str, Contender]:
+    """pinocchio from Python and, where it was built, from C++."""
+    import numpy as np
+    import pinocchio
+
+    from jaxpanda.panda import panda
+
+    arm = panda()
+    model = pinocchio.Model()
+    parent = 0
+    numbers = [[arm.dof], np.ravel(arm.chain.gravity)]
+    for i in range(arm.dof):
+        R, p, phi = (np.asarray(x) for x in (arm.chain.R[i], arm.chain.p[i], arm.standard[i]))
+        parent = model.addJoint(parent, pinocchio.JointModelRZ(), pinocchio.SE3(R, p), f"joint{i}")
+        model.appendBodyToJoint(
+            parent, pinocchio.Inertia.FromDynamicParameters(phi), pinocchio.SE3.Identity()
+        )
+        numbers += [np.ravel(R), p, phi]
+    text = " ".join(repr(float(v)) for row in numbers for v in row).replace("7.0 ", "7 ", 1)
+    data = model.createData()
+    states = np.random.default_rng(0).uniform(-2, 2, (5000, 3, 7))
+    found = {}
+    for name, f in (
+        ("rnea", pinocchio.rnea),
+        ("regressor", pinocchio.computeJointTorqueRegressor),
+    ):
+
+        def loop(f=f):
+            for q, qd, qdd in states:
+                f(model, data, q, qd, qdd)
+
+        found[f"{name}, pinocchio from Python, float64"] = timed(loop, len(states))
+    if (folder / "pinocchio").exists():
+        for place, name in enumerate(("rnea", "regressor")):
+
+            def run(place=place) -> tuple[float, float]:
+                command = [str(folder / "pinocchio"), "20000"]
+                done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
+                value = float(done.stdout.split()[place])
+                return value, value
+
+            found[f"{name}, pinocchio C++, float64"] = run
+    return found
+
+
+def mujoco_threads(folder: Path, cores: int) -> dict[str, Contender]:
+    if not (folder / "mujoco").exists():
+        return {}
+
+    def run() -> tuple[float, float]:
+        command = [str(folder / "mujoco"), str(folder / "panda.xml"), "100000", str(cores)]
+        value = float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[0])
+        return value, value * cores
+
+    return {f"rnea, mj_inverse on {cores} threads, float64": run}
+
+
+def mjx(folder: Path, batch: int, note: Callable[[str, float], None]) -> dict[str, Contender]:
+    import jax
+    import jax.numpy as jnp
+    import mujoco
+    from mujoco import mjx as mujoco_x
+
+    model = mujoco.MjModel.from_xml_path(str(folder / "panda.xml"))
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    device = mujoco_x.put_model(model)
+    blank = mujoco_x.make_data(device)
+
+    @jax.jit
+    @jax.vmap
+    def torque(q, qd, qdd):
+        return mujoco_x.inverse(device, blank.replace(qpos=q, qvel=qd, qacc=qdd)).qfrc_inverse
+
+    states = [s * jnp.ones((batch, 7), jnp.float32) for s in (0.3, 0.2, 0.1)]
+    start = time.perf_counter()
+    jax.block_until_ready(torque(*states))
+    name = f"rnea, mjx.inverse vmapped over {batch}, float32"
+    note(name, time.perf_counter() - start)
+    return {name: timed(lambda: jax.block_until_ready(torque(*states)), batch)}
+
+
+def measure(cores: int, batch: int, rounds: int, folder: Path) -> dict:
+    """All contenders on `cores` cores (0: a GPU); run in a process of its own."""
+    if cores:
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+    compilation = {}
+    contenders = ours(batch, compilation.__setitem__, all_forms=cores != 1)
+    if cores == 1:
+        contenders |= pinocchio_loops(folder)
+    elif cores:
+        contenders |= mujoco_threads(folder, cores)
+        contenders |= mjx(folder, 32, compilation.__setitem__)
+    samples: dict[str, list] = {name: [] for name in contenders}
+    for _ in range(rounds):
+        for name, run in contenders.items():
+            samples[name].append(run())
+    return {
+        name: {
+            "wall_ns": statistics.median(w for w, _ in values),
+            "wall_ns_range": [min(w for w, _ in values), max(w for w, _ in values)],
+            "process_ns": statistics.median(p for _, p in values),
+            "process_ns_least": min(p for _, p in values),
+            "first_call_s": compilation.get(name),
+        }
+        for name, values in samples.items()
+    }
+
+
+def machine() -> dict:
+    names = ["jax", "jaxlib", "pin", "mujoco", "mujoco-mjx", "numpy"]
+    versions = {}
+    for name in names:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = None
+    info = Path("/proc/cpuinfo")
+    models = (
+        [x.split(":")[1].strip() for x in info.read_text().splitlines() if "model name" in x]
+        if info.exists()
+        else []
+    )
+    return {
+        "processor": models[0] if models else platform.processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "load": os.getloadavg()[0],
+        "python": platform.python_version(),
+        "versions": versions,
+    }
+
+
+def show(title: str, rows: dict) -> None:
+    print(
+        f"\n{title}\n{'':52}{'wall ns':>10}{'range':>22}{'process ns':>12}{'evals/s':>11}{'first call s':>14}"
+    )
+    for name, row in rows.items():
+        low, high = row["wall_ns_range"]
+        first = f"{row['first_call_s']:.1f}" if row["first_call_s"] else ""
+        wall = row["wall_ns"]
+        print(
+            f"{name:52}{wall:10.4g}{f'{low:.4g} - {high:.4g}':>22}"
+            f"{row['process_ns']:12.4g}{1e9 / wall:11.2e}{first:>14}"
+        )
+
+
+RATIOS = [
+    (1, "rnea, pinocchio C++, float64", "rnea, columns, float64", 5),
+    (1, "rnea, pinocchio C++, float64", "rnea, columns, float32", 10),
+    (1, "regressor, pinocchio C++, float64", "regressor, columns, float64", 2),
+    (2, "rnea, mj_inverse on 2 threads, float64", "rnea, columns, float64", 10),
+    (2, "rnea, mjx.inverse vmapped over 32, float32", "rnea, columns, float32", 20),
+    (0, "rnea, plain definition, float32", "rnea, columns, float32", 10),
+]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--batch", type=int, default=100_001, help="samples a call")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--gpu", action="store_true", help="measure JAX's GPU in place of the processor")
+    parser.add_argument(
+        "--include", action="append", default=[], help="folder of further C++ headers (Eigen)"
+    )
+    parser.add_argument("--baseline", action="store_true", help=f"replace {BASELINE.name}")
+    parser.add_argument("--child", nargs=2, metavar=("CORES", "FOLDER"), help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.child:
+        print(json.dumps(measure(int(args.child[0]), args.batch, args.rounds, Path(args.child[1]))))
+        return
+
+    result: dict = {"machine": machine(), "batch": args.batch, "rounds": args.rounds}
+    print(json.dumps(result, indent=1))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        reasons = {}
+        if not args.gpu:
+            from jaxpanda.export import panda_mjcf
+
+            (folder / "panda.xml").write_text(panda_mjcf())
+            reasons = build_peers(folder, args.include)
+        for cores in [0] if args.gpu else [1, result["machine"]["cores"]]:
+            command = [sys.executable, __file__, "--child", str(cores), name]
+            command += ["--batch", str(args.batch), "--rounds", str(args.rounds)]
+            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            rows = json.loads(done.stdout.splitlines()[-1])
+            result["gpu" if cores == 0 else f"cores {cores}"] = rows
+            show("on a GPU" if cores == 0 else f"on {cores} core(s)", rows)
+            for of, peer, fast, target in RATIOS:
+                if of == cores and peer in rows:
+                    ratio = rows[peer]["wall_ns"] / rows[fast]["wall_ns"]
+                    print(f"  {fast}: {ratio:.1f} times as fast as {peer} (target {target})")
+    for peer, reason in reasons.items():
+        print(f"not measured: {peer}: {reason}")
+    if args.baseline:
+        BASELINE.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
