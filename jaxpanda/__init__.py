@@ -13,17 +13,16 @@ here switches on float64, which identification needs (`jax.config.update("jax_en
 import importlib
 from typing import TYPE_CHECKING, Any
 
-
 if TYPE_CHECKING:
     from .arm import Arm as Arm
     from .demo import demonstrate as demonstrate
     from .errors import InputError as InputError
-    from .pipeline import to_mjcf as to_mjcf
     from .feasible import Bounds as Bounds
     from .identification import Identification as Identification
     from .identification import identify as identify
     from .identification import identify_mass_gravity as identify_mass_gravity
     from .inspection import inspect as inspect
+    from .pipeline import to_mjcf as to_mjcf
     from .recordings import Recording as Recording
     from .recordings import load as load
     from .recordings import save as save
@@ -52,7 +51,7 @@ _HOME = {
     "to_mjcf": "pipeline",
     "validate": "validation",
 }
-__all__ = [*_HOME]  # noqa: PLE0604
+__all__ = [*_HOME]
 
 
 def __getattr__(name: str) -> Any:

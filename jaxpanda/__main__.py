@@ -26,7 +26,7 @@ class Demo:
     """Recordings (CSV, .npz, .parquet or a folder of raw logs); without any, a virtual Panda is recorded."""
     model: Path | None = None
     """The simulation as you have it (MJCF); without it, the project's own Panda."""
-    starts: int = 1024
+    starts: int = 2048
     """Random starts of the retrieval."""
     seed: int = 0
     json: bool = False
@@ -35,7 +35,9 @@ class Demo:
     def run(self) -> Any:
         from .demo import demonstrate
 
-        return demonstrate(self.out, recordings=self.recording, model=self.model, starts=self.starts, seed=self.seed)
+        return demonstrate(
+            self.out, recordings=self.recording, model=self.model, starts=self.starts, seed=self.seed
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,15 +107,15 @@ class Retrieve:
     """identification.json, or a table of coefficients with the same fields."""
     out: Path
     """Folder for retrieval.json and starts.npz."""
-    starts: int = 1024
+    starts: int = 2048
     """Random starts."""
     seed: int = 0
     bounds: Path | None = None
     """CSV with name, lower, upper for each link parameter; without it, the published bounds of the Panda."""
     model: Path | None = None
     """The arm (MJCF) that bounds are set around when it is not the Panda and --bounds is absent."""
-    weighting: Literal["none", "covariance"] = "none"
-    """All coefficients alike, as the paper has it, or each by how sure it is."""
+    weighting: Literal["none", "torque"] = "none"
+    """All coefficients alike, as the paper has it, or each direction by the torque it moved."""
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -146,7 +148,6 @@ class Export:
 
     def run(self) -> Any:
         from . import pipeline
-
         from .retrieval import Retrieval
 
         return pipeline.to_mjcf(Retrieval.load(self.retrieval), self.out, self.model)
@@ -173,7 +174,49 @@ class Validate:
         return pipeline.validate_files(self.out, self.model, self.recording, cutoff=self.cutoff)
 
 
-_COMMANDS = (Demo, Inspect, Identify, Retrieve, Export, Validate)
+@dataclasses.dataclass(frozen=True)
+class Diagnose:
+    """Which physics the simulation is missing: located, named, modelled, and shown to help."""
+
+    recording: tuple[Path, ...]
+    """Recordings with torque."""
+    out: Path
+    """Folder for diagnosis.json and corrected.xml."""
+    model: Path | None = None
+    """The simulation as you have it (MJCF); without it, the project's own Panda."""
+    reference: tuple[Path, ...] = ()
+    """Recordings of the same arm from when nothing was wrong."""
+    knowledge: Literal["exact", "identified", "rough", "unknown"] = "identified"
+    """How well the numbers in the model are known."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import diagnosis
+
+        return diagnosis.diagnose_files(self.out, self.model, self.recording, self.reference, self.knowledge)
+
+
+@dataclasses.dataclass(frozen=True)
+class Predict:
+    """Torque of a motion, from the corrected model."""
+
+    diagnosis: Path
+    """Folder that `diagnose` wrote."""
+    recording: Path
+    """The motion: a recording, with or without torque."""
+    out: Path
+    """The CSV to write."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import diagnosis
+
+        return diagnosis.predict_files(self.diagnosis, self.recording, self.out)
+
+
+_COMMANDS = (Demo, Inspect, Identify, Retrieve, Export, Validate, Diagnose, Predict)
 
 
 def _parse(arguments: list[str]) -> Any:
@@ -201,7 +244,11 @@ def _parse(arguments: list[str]) -> Any:
 def _one_line(panel: str) -> str:
     """A framed complaint of tyro's as one sentence."""
     words = " ".join(line.strip("╭╮╰╯│─ ") for line in panel.splitlines())
-    words = words.replace("•", " ").replace("For full helptext, run:", "; see").replace("For full helptext, run", "; see")
+    words = (
+        words.replace("•", " ")
+        .replace("For full helptext, run:", "; see")
+        .replace("For full helptext, run", "; see")
+    )
     return " ".join(words.split()).replace(" ;", ";")
 
 

@@ -7,6 +7,9 @@ import jax.numpy as jnp
 from jaxpanda_kernels import Chain, rnea
 from jaxtyping import Array, Float
 
+KNOWN = ("armature", "damping", "frictionloss", "stiffness", "springref")
+"""Fields of an `Arm` that hold its physics beyond rigid links."""
+
 
 class Arm(eqx.Module):
     """A serial arm: the numeric `Chain`, its nominal parameters, and what to call its parts.

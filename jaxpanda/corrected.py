@@ -75,7 +75,11 @@ class Corrected(eqx.Module):
     @property
     def as_written(self) -> "Corrected":
         """The same effects on the user's own numbers."""
-        zeros = (jnp.zeros_like(self.change), jnp.zeros_like(self.damping_change), jnp.zeros_like(self.damping_change))
+        zeros = (
+            jnp.zeros_like(self.change),
+            jnp.zeros_like(self.damping_change),
+            jnp.zeros_like(self.damping_change),
+        )
         return eqx.tree_at(lambda c: (c.change, c.damping_change, c.frictionloss_change), self, zeros)
 
     @property

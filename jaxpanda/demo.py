@@ -10,24 +10,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from . import report, summaries
-from .arm import Arm
 from .errors import require_x64
 from .export import panda_mjcf
 from .files import output_folder
-from .friction import Friction
 from .identification import Identification, identify
 from .inspection import inspect
-from .mjcf import standard_from_com
+from .mjcf import from_mjcf, standard_from_com
 from .panda import published
-from .pipeline import arm_of, recordings_of, to_mjcf
+from .pipeline import arm_of, beyond_mjcf, recordings_of, to_mjcf
 from .recordings import Recording, save
 from .report import Section, number
 from .retrieval import Retrieval, retrieve
 from .session import progress
 from .simulation import (
     JointFriction,
+    Sensors,
     body_inertias,
     fourier_trajectory,
     panda_sensors,
@@ -35,7 +35,7 @@ from .simulation import (
     random_trajectory,
     simulate,
 )
-from .validation import Validation, validate
+from .validation import Validation, arm_model, validate
 
 MODEL = "panda.xml"
 REPORT = "report.html"
@@ -47,8 +47,8 @@ class Virtual:
 
     recording: Recording
     held_out: Recording
-    standard: np.ndarray
-    """(dof, 10), as in `jaxpanda_kernels.inertia`."""
+    standard: Float[np.ndarray, "dof 10"] | None
+    """As in `jaxpanda_kernels.inertia`; None for a user's arm, whose bodies need not be its links."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +69,9 @@ class Demonstration:
             "model": MODEL,
             "report": REPORT,
             "relative_error_percent": self.identification.relative_error_percent,
-            "cross_validated_relative_error_percent": self.identification.cross_validated_relative_error_percent,
+            "cross_validated_relative_error_percent": (
+                self.identification.cross_validated_relative_error_percent
+            ),
             "objective": self.retrieval.objective,
             "max_violation": self.retrieval.max_violation,
             "validation": self.validation.to_json(),
@@ -82,7 +84,7 @@ def demonstrate(
     *,
     recordings: Sequence[Path] = (),
     model: Path | None = None,
-    starts: int = 1024,
+    starts: int = 2048,
     seed: int = 0,
 ) -> Demonstration:
     """Record (virtually, unless recordings are given), identify, retrieve, export, validate, report.
@@ -107,7 +109,7 @@ def demonstrate(
             testing = training
         else:
             with progress("recording a virtual arm"):
-                virtual = record(seed, None if model is None else Path(model).read_text("utf-8"))
+                virtual = record(seed, model)
             save(virtual.recording, folder / "recording.csv")
             save(virtual.held_out, folder / "held_out.csv")
             training, testing = [virtual.recording], [virtual.held_out]
@@ -117,21 +119,29 @@ def demonstrate(
         found.save(folder)
         with progress("random starts") as tick:
             links = retrieve(
-                found, arm=None if model is None else arm, weighting="covariance", starts=starts, seed=seed, progress=tick
+                found,
+                arm=None if model is None else arm,
+                weighting="torque",
+                starts=starts,
+                seed=seed,
+                progress=tick,
             )
         links.save(folder)
         with progress("exporting and validating"):
             written = to_mjcf(links, folder / MODEL, model)
-            checked = validate(folder / MODEL, testing, friction=offset_of(links.friction))
+            beyond, beside = beyond_mjcf(folder / MODEL)
+            checked = validate(folder / MODEL, testing, friction=beyond)
+            checked = dataclasses.replace(checked, model=MODEL, notes=(*checked.notes, *beside))
         checked.save(folder)
         held_out = "the held-out recording" if virtual else "the recording itself"
         headline = Section(
             "In short",
             [
-                f"Torque error {number(found.cross_validated_relative_error_percent, 3)} % on motion that the fit had "
-                f"not seen (cross-validated); {number(checked.relative_error_percent, 3)} % by {MODEL} on {held_out}.",
-                f"{MODEL} holds links that could be built: largest violation {links.max_violation:g}, total mass "
-                f"{links.standard[:, 0].sum():.2f} kg.",
+                f"Torque error {number(found.cross_validated_relative_error_percent, 3)} % on motion that the "
+                f"fit had not seen (cross-validated); {number(checked.relative_error_percent, 3)} % by {MODEL} "
+                f"on {held_out}.",
+                f"{MODEL} holds links that could be built: largest violation {links.max_violation:g}, total "
+                f"mass {links.standard[:, 0].sum():.2f} kg.",
                 *(_against_truth(found, virtual.standard) if virtual else ()),
             ],
         )
@@ -151,48 +161,44 @@ def demonstrate(
     )
 
 
-def record(seed: int, mjcf: str | None = None) -> Virtual:
+def record(seed: int, model: Path | None = None, duration: float = 20.0) -> Virtual:
     """Let MuJoCo's C engine move an arm whose parameters differ from its model's by about a tenth.
 
-    The Panda follows the published exciting trajectory; any other arm, and the held-out recording, a random one.
-    Friction has the published sizes on a Panda, and none elsewhere.
+    The Panda follows the published exciting trajectory and has friction and sensors of published sizes; any
+    other arm follows a random one, under noise of 0.02 N m. The held-out recording is of another motion.
     """
-    text = mjcf or panda_mjcf()
-    truth = perturbed(text, seed)
-    friction = None
-    trajectory = random_trajectory(truth, seed)
-    if mjcf is None:
+    if model is None:
+        truth = perturbed(panda_mjcf(), seed)
         table = published()
         trajectory = fourier_trajectory(**{k: table["exciting_trajectory"][k] for k in ("a", "b", "q0")})
-        law = table["classical_friction"]
-        viscous = np.maximum(np.array(law["viscous"]), 0.0)
-        friction = JointFriction(viscous, np.array(law["coulomb"]), np.array(law["offset"]))
-    sensors = panda_sensors() if mjcf is None else None
+        law = {k: np.array(values) for k, values in table["classical_friction"].items()}
+        world: dict[str, Any] = {
+            "friction": JointFriction(np.maximum(law["viscous"], 0.0), law["coulomb"], law["offset"]),
+            "sensors": panda_sensors(),
+        }
+    else:
+        truth = perturbed(arm_model(from_mjcf(model)[1]), seed)
+        trajectory = random_trajectory(truth, seed)
+        world = {"sensors": Sensors(torque_noise=0.02)}
     held_out = random_trajectory(truth, seed + 1)
+    standard = np.array([standard_from_com(*body) for body in zip(*body_inertias(truth), strict=True)])
     return Virtual(
-        simulate(truth, trajectory, friction=friction, sensors=sensors, seed=seed, name="recording.csv"),
-        simulate(truth, held_out, duration=10.0, friction=friction, sensors=sensors, seed=seed + 1, name="held_out.csv"),
-        np.array([standard_from_com(*body) for body in zip(*body_inertias(truth), strict=True)])[-truth.nv :],
+        simulate(truth, trajectory, duration=duration, seed=seed, name="recording.csv", **world),
+        simulate(truth, held_out, duration=duration / 2, seed=seed + 1, name="held_out.csv", **world),
+        standard[-truth.nv :] if model is None else None,
     )
 
 
-def offset_of(friction: Friction | None) -> Friction | None:
-    """What of the friction found an MJCF has no place for."""
-    if friction is None or not np.any(friction.offset):
-        return None
-    zero = np.zeros_like(friction.offset)
-    return Friction("coulomb_viscous_offset", {"viscous": zero, "coulomb": zero, "offset": friction.offset})
-
-
-def _against_truth(found: Identification, standard: np.ndarray) -> list[str]:
+def _against_truth(found: Identification, standard: Float[np.ndarray, "dof 10"] | None) -> list[str]:
     """How far identified coefficients are from the virtual arm's own, in standard deviations."""
-    if found.std is None:
+    if found.std is None or standard is None:
         return []
     distance = np.abs(found.beta - found.projection @ standard.ravel()) / found.std
     inside = int(np.sum(distance <= 2))
     return [
-        f"The virtual arm's own {len(distance)} coefficients are known: {inside} were found within two standard "
-        f"deviations (about {0.95 * len(distance):.0f} should be), the farthest {distance.max():.1f} away."
+        f"The virtual arm's own {len(distance)} coefficients are known: {inside} were found within two "
+        f"standard deviations (about {0.95 * len(distance):.0f} should be), the farthest "
+        f"{distance.max():.1f} away."
     ]
 
 
@@ -202,7 +208,7 @@ def _provenance(recordings: Sequence[Recording], starts: int, seed: int) -> Sect
     return Section(
         "Provenance",
         [
-            f"Recordings: {', '.join(recording.name for recording in recordings)}; {starts} starts, seed {seed}.",
+            f"Recordings: {', '.join(one.name for one in recordings)}; {starts} starts, seed {seed}.",
             f"Python {platform.python_version()} on {platform.platform()}; {versions}.",
             f"Command: {' '.join(Path(word).name if i == 0 else word for i, word in enumerate(sys.argv))}",
         ],

@@ -16,7 +16,6 @@ lags at reversals. With MuJoCo's defaults that is most visible at light joints; 
 and an impedance near one make it the law that is meant.
 """
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo's names come from a compiled module without stubs.
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,7 +30,7 @@ from jaxtyping import Array, Float
 from . import markup
 from .arm import Arm
 from .errors import InputError
-from .files import to_json, write_text
+from .files import read_json, to_json, write_text
 from .friction import Friction
 from .lint import ignored_by_mjx
 from .markup import numbers
@@ -458,6 +457,26 @@ def sidecar(arm: Arm, friction: Friction | None) -> dict[str, Any]:
         "torque_offset": [float(value) for value in offset],
         "friction": law.to_json() if law else [],
     }
+
+
+def read_sidecar(path: str | Path) -> dict[str, Any]:
+    """What `sidecar` said, from a file.
+
+    Raises:
+        InputError: the file is no sidecar.
+    """
+    document = read_json(path)
+    if not isinstance(document, dict) or document.get("schema") != SIDECAR:
+        raise InputError(f"{path}: is no sidecar of an export (schema {SIDECAR!r}); move it away")
+    offset, joints = document.get("torque_offset"), document.get("joints")
+    if (
+        not isinstance(offset, list)
+        or not isinstance(joints, list)
+        or len(joints) != len(offset)
+        or not all(isinstance(value, int | float) for value in offset)
+    ):
+        raise InputError(f"{path}: torque_offset must hold one number a joint")
+    return document
 
 
 def _missing_assets(document: markup.Document, folder: Path) -> tuple[str, ...]:

@@ -55,7 +55,9 @@ def read_json(path: str | Path) -> Any:
     try:
         return json.loads(text, parse_constant=_refuse_constant)
     except json.JSONDecodeError as error:
-        raise InputError(f"{path}: line {error.lineno}, column {error.colno}: {error.msg}; JSON is expected") from None
+        raise InputError(
+            f"{path}: line {error.lineno}, column {error.colno}: {error.msg}; JSON is expected"
+        ) from None
     except _NotFiniteError as error:
         raise InputError(f"{path}: holds {error}, where a finite number is needed") from None
 

@@ -1,6 +1,5 @@
 """Slips in an MJCF that MuJoCo compiles without a word."""
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo's names come from a compiled module without stubs.
 import dataclasses
 from collections.abc import Iterator

@@ -10,7 +10,6 @@ as in files made from a modified Denavit-Hartenberg table; else the body's turne
 brings z onto the axis, with its origin at the joint's position.
 """
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo's names come from a compiled module without stubs.
 import dataclasses
 import warnings

@@ -3,16 +3,21 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import jax.numpy as jnp
+import numpy as np
+
+from . import markup
 from .arm import Arm
 from .errors import InputError
-from .export import Change, panda_mjcf, sidecar, write_parameters
-from .files import output_folder, to_json, write_text
+from .export import Change, not_held, panda_mjcf, read_sidecar, to_urdf, write_parameters
+from .files import output_folder, write_text
 from .friction import Friction
 from .identification import Identification, identify, identify_mass_gravity
 from .inspection import Inspection, inspect
-from .mjcf import from_mjcf
+from .lint import lint
+from .mjcf import from_document, from_mjcf
 from .recordings import Recording, load_many
 from .retrieval import Retrieval, retrieve
 from .session import progress
@@ -95,7 +100,7 @@ def retrieve_files(
     bounds: Path | None,
     model: Path | None,
     *,
-    weighting: str,
+    weighting: Literal["none", "torque"],
     starts: int,
     seed: int,
 ) -> Retrieval:
@@ -103,7 +108,13 @@ def retrieve_files(
     arm = None if model is None else Arm.from_mjcf(model)
     with output_folder(out) as folder, progress("random starts") as tick:
         links = retrieve(
-            identification, bounds=bounds, arm=arm, weighting=weighting, starts=starts, seed=seed, progress=tick
+            identification,
+            bounds=bounds,
+            arm=arm,
+            weighting=weighting,
+            starts=starts,
+            seed=seed,
+            progress=tick,
         )
         links.save(folder)
     return links
@@ -130,7 +141,8 @@ class Export:
 def to_mjcf(links: Retrieval, out: str | Path, model: str | Path | None = None) -> Export:
     """Write retrieved links, and the friction identified with them, as MJCF (or URDF, by the suffix).
 
-    What MJCF cannot hold (a constant offset, a sigmoid) goes into `<name>.jaxpanda.json` beside it.
+    Armature, springs and friction that the identified model held stay, in whichever file is written. What MJCF
+    cannot hold (a constant offset, a sigmoid) goes into `<name>.jaxpanda.json` beside it.
 
     Args:
         links: what `retrieve` found.
@@ -141,30 +153,36 @@ def to_mjcf(links: Retrieval, out: str | Path, model: str | Path | None = None) 
         InputError: the model holds another arm, or cannot hold the parameters.
     """
     out = Path(out)
-    if model is None:
-        arm, source = Arm.panda(), None
-    else:
-        arm, source = from_mjcf(model)
+    own = model is None
+    arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", out)) if own else from_mjcf(model)
     if links.dof != arm.dof:
         raise InputError(f"{model or 'the Panda'}: has {arm.dof} links, but the retrieval has {links.dof}")
+    arm = dataclasses.replace(arm, **{name: jnp.asarray(values) for name, values in links.known.items()})
     if out.suffix == ".urdf":
-        from .urdf import to_urdf
-
         write_text(out, to_urdf(arm, links.standard, links.friction))
-        return Export(out, (), ())
-    if source is None:
-        write_text(out, panda_mjcf(links.standard, links.friction))
-        write_text(out.with_name(f"{out.stem}.jaxpanda.json"), to_json(sidecar(arm, links.friction)))
-        return Export(out, (), ())
+        return Export(out, (), not_held(arm, links.friction))
     written = write_parameters(source, arm, links.standard, links.friction)
-    return Export(out, written.changes, (*written.warnings, *written.save(out)))
+    return Export(out, () if own else written.changes, (*written.warnings, *written.save(out)))
 
 
-def validate_files(
-    out: Path, model: Path, recordings: Sequence[Path], *, cutoff: float, friction: Friction | None = None
-) -> Validation:
-    """`jaxpanda validate`."""
+def validate_files(out: Path, model: Path, recordings: Sequence[Path], *, cutoff: float) -> Validation:
+    """`jaxpanda validate`: with the offset in an exported file's sidecar, and what the lint has to say."""
     with output_folder(out) as folder:
+        friction, beside = beyond_mjcf(model)
         checked = validate(model, recordings_of(recordings), cutoff=cutoff, friction=friction)
+        slips = tuple(f"{slip.severity}: {slip.where}: {slip.message}" for slip in lint(model))
+        checked = dataclasses.replace(checked, notes=(*checked.notes, *beside, *slips))
         checked.save(folder)
     return checked
+
+
+def beyond_mjcf(model: Path) -> tuple[Friction | None, tuple[str, ...]]:
+    """The constant torque in `<name>.jaxpanda.json` beside a model that was exported here, and a note of it."""
+    file = model.with_name(f"{model.stem}.jaxpanda.json")
+    if not file.exists():
+        return None, ()
+    offset = np.array(read_sidecar(file)["torque_offset"])
+    zero = np.zeros_like(offset)
+    return Friction("coulomb_viscous_offset", {"viscous": zero, "coulomb": zero, "offset": offset}), (
+        f"the constant joint torque in {file.name}, for which MJCF has no place, was added",
+    )

@@ -1,7 +1,7 @@
 """Results as sections of text, tables and figures: on a terminal, and as one self-contained page.
 
-A stage's summary is written once, as `Section`s (`jaxpanda.summaries`); `to_terminal` and `to_html` are the two
-ways to read it. The page needs no network: figures are SVG inside it.
+A stage's summary is written once, as `Section`s (`jaxpanda.summaries`); `to_terminal` and `to_html` are the
+two ways to read it. The page needs no network: figures are SVG inside it.
 """
 
 import dataclasses
@@ -9,9 +9,9 @@ import io
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from .files import write_text
-
 
 _PIPED_WIDTH = 200
 """Columns of text that goes to a file or a pipe; a terminal knows its own width."""
@@ -77,7 +77,9 @@ def to_html(title: str, sections: Sequence[Section], path: str | Path) -> None:
     pages = jinja2.Environment(
         loader=jinja2.PackageLoader("jaxpanda"), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
-    drawn = [(section, [(_svg(figure), figure.caption) for figure in section.figures]) for section in sections]
+    drawn = [
+        (section, [(_svg(figure), figure.caption) for figure in section.figures]) for section in sections
+    ]
     write_text(path, pages.get_template("report.html.j2").render(title=title, sections=drawn))
 
 
@@ -87,7 +89,13 @@ def _svg(figure: Figure) -> str:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure as Canvas
 
-    style = {"svg.fonttype": "none", "font.size": 8, "axes.grid": True, "grid.alpha": 0.3, "lines.linewidth": 0.9}
+    style: Any = {
+        "svg.fonttype": "none",
+        "font.size": 8,
+        "axes.grid": True,
+        "grid.alpha": 0.3,
+        "lines.linewidth": 0.9,
+    }
     with matplotlib.rc_context(style):
         canvas = Canvas(figsize=figure.size, layout="constrained")
         FigureCanvasSVG(canvas)

@@ -22,6 +22,8 @@ from .feasible.solver import STARTS
 from .files import finite, output_folder, read_json, to_json
 from .friction import Friction
 from .identification import Identification
+from .identification.result import known_physics
+from .panda import panda
 from .parameters import coefficient_matrix
 
 SCHEMA = "jaxpanda.retrieval/1"
@@ -29,6 +31,8 @@ FILE = "retrieval.json"
 STARTS_FILE = "starts.npz"
 AS_GOOD = 1.01
 """A solution is as good as the best where its objective is within this factor of it."""
+CONCESSION = 5e-4
+"""Share of the objective that may be given up to stay near the nominal parameters."""
 ACTIVE = 1e-5
 """A constraint is active where its margin is below this share of its box (triangle inequality: [kg m²])."""
 
@@ -64,6 +68,8 @@ class Retrieval:
     arm: str = ""
     friction: Friction | None = None
     """As identified; carried along for the export."""
+    known: Mapping[str, Float[np.ndarray, " dof"]] = dataclasses.field(default_factory=dict)
+    """What the model that was identified held beyond rigid links; carried along too."""
     notes: tuple[str, ...] = ()
     """What the user should know before relying on this."""
     solutions: Solutions | None = None
@@ -96,6 +102,7 @@ class Retrieval:
             "links": self.links,
             "standard": self.standard.tolist(),
             "friction": [] if self.friction is None else self.friction.to_json(),
+            "known": {name: values.tolist() for name, values in self.known.items()},
             "margins": dict(self.margins),
             "active": list(self.active),
             "as_good": self.as_good,
@@ -146,6 +153,7 @@ class Retrieval:
                 link_names=tuple(link["name"] for link in document["links"]),
                 arm=document["arm"],
                 friction=Friction.from_json(document["friction"]) if document["friction"] else None,
+                known=known_physics(document["known"], len(document["links"]), str(file)),
                 notes=tuple(document["notes"]),
                 solutions=_load_starts(file.with_name(STARTS_FILE)),
             )
@@ -161,9 +169,9 @@ def retrieve(
     bounds: Bounds | str | Path | None = None,
     arm: Arm | None = None,
     constraints: Sequence[Constraint] = (),
-    weighting: Literal["none", "covariance"] = "none",
+    weighting: Literal["none", "torque"] = "none",
     penalty: Literal["smooth", "exact"] = "smooth",
-    prefer: Literal["best", "nominal"] = "best",
+    prefer: Literal["best", "nominal"] = "nominal",
     starts: int = STARTS,
     seed: int = 0,
     certificate: bool | Literal["auto"] = "auto",
@@ -178,11 +186,14 @@ def retrieve(
         identification: a result, a table with the field `coefficients`, or the file that holds either.
         bounds: boxes on the links' parameters, or their table. Without them: around `arm` where one is given,
             the published ones for a Panda.
-        arm: whose nominal parameters to set bounds around, and to be near to under `prefer="nominal"`.
+        arm: whose nominal parameters to set bounds around, and to stay near to under `prefer="nominal"`.
         constraints: further ones, as functions of `Links` that return margins.
-        weighting: "none" as in the paper; "covariance" weighs each coefficient by how sure it is.
+        weighting: "none" as in the paper, on the reliable coefficients; "torque" weighs every direction of
+            all coefficients by the torque it moved in the data, so that the links lose as little of the fit as
+            they can.
         penalty: "smooth" is `feasible.solve`; "exact" is the paper's Algorithm 1, for comparison.
-        prefer: among starts as good as the best, the very best, or the nearest to `arm`.
+        prefer: "best", the lowest objective; "nominal", near to the nominal parameters (of `arm`, else the
+            Panda's) in all that the coefficients do not tell, at an objective no more than `CONCESSION` higher.
         starts: random starts.
         seed: same seed, same answer.
         certificate: lower bound by convex optimisation; "auto" where the extra [sdp] is installed.
@@ -195,8 +206,9 @@ def retrieve(
     table = _identified(identification)
     boxes = _bounds(bounds, arm, table)
     A, b = _equations(table, boxes.dof, weighting)
+    constraints = tuple(constraints)
     run = {"smooth": solve, "exact": exact_penalty}[penalty]
-    found = run(A, b, boxes, constraints=tuple(constraints), starts=starts, seed=seed, progress=progress)
+    found = run(A, b, boxes, constraints=constraints, starts=starts, seed=seed, progress=progress)
     feasible = found.violation == 0
     if not feasible.any() and penalty == "smooth":
         raise InputError(
@@ -205,16 +217,19 @@ def retrieve(
         )
     as_good = feasible & (found.objective <= AS_GOOD * found.objective[found.best])
     as_good[found.best] = True
-    chosen = _nearest(found.phi, as_good, arm, boxes) if prefer == "nominal" else found.best
+    phi, violation = found.phi[found.best], float(found.violation[found.best])
+    nominal = _nominal(arm, table)
+    if prefer == "nominal" and nominal is not None and feasible.any():
+        phi, violation = _towards(nominal, A, b, boxes, constraints, phi), 0.0
     wanted = certificate is True or (
         certificate == "auto" and importlib.util.find_spec("clarabel") is not None
     )
-    margins = _margins(found.phi[chosen], boxes, constraints)
+    margins = _margins(phi, boxes, constraints)
     names = table.link_names if len(table.link_names) == boxes.dof else ()
     return Retrieval(
-        standard=found.phi[chosen],
-        objective=float(found.objective[chosen]),
-        max_violation=float(found.violation[chosen]),
+        standard=phi,
+        objective=float(np.sum((A @ phi.ravel() - b) ** 2)),
+        max_violation=violation,
         margins=margins,
         active=tuple(_active(margins, boxes)),
         spread=_spread(found.phi[as_good]),
@@ -229,6 +244,7 @@ def retrieve(
         link_names=names or tuple(f"link{i + 1}" for i in range(boxes.dof)),
         arm=table.arm,
         friction=table.friction,
+        known=table.known,
         notes=tuple(_notes(table, found)),
         solutions=found,
     )
@@ -262,20 +278,66 @@ def _bounds(bounds: Bounds | str | Path | None, arm: Arm | None, table: Identifi
 def _equations(
     table: Identification, dof: int, weighting: str
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " rows"]]:
-    """Rows of the reliable coefficients, weighed."""
-    kept = np.flatnonzero(table.reliable)
-    if len(kept) == 0:
-        raise InputError("coefficients: none is reliable, so there is nothing to retrieve from")
-    A = coefficient_matrix(table.terms, dof)[kept]
-    b = table.beta[kept]
+    """Rows of the coefficients, weighed."""
+    A, b = coefficient_matrix(table.terms, dof), table.beta
     if weighting == "none":
-        return A, b
-    if table.covariance is not None:
-        root = np.linalg.cholesky(table.covariance[np.ix_(kept, kept)])
-        return np.linalg.solve(root, A), np.linalg.solve(root, b)
-    if table.std is None or not np.all(table.std[kept] > 0):
-        raise InputError("coefficients: weighting by covariance needs a positive 'std' of every coefficient")
-    return A / table.std[kept, None], b / table.std[kept]
+        if not table.reliable.any():
+            raise InputError("coefficients: none is reliable, so there is nothing to retrieve from")
+        return A[table.reliable], b[table.reliable]
+    covariance = table.classical_covariance
+    if covariance is None:
+        if table.std is None or not np.all((table.std > 0) & np.isfinite(table.std)):
+            raise InputError("coefficients: weighting by torque needs a positive 'std' of every coefficient")
+        covariance = np.diag(table.std**2)
+    values, vectors = np.linalg.eigh(covariance)
+    if values[-1] <= 0:
+        raise InputError("coefficients: their covariance is zero, so torque cannot weigh them")
+    root = vectors / np.sqrt(np.maximum(values, 1e-14 * values[-1]))
+    return root.T @ A, root.T @ b
+
+
+def _nominal(arm: Arm | None, table: Identification) -> Float[np.ndarray, "dof 10"] | None:
+    """What the links were thought to be, where that is known."""
+    if arm is None and table.arm in ("", "panda") and table.dof == 7:
+        arm = panda()
+    return None if arm is None else np.asarray(arm.standard)
+
+
+def _towards(
+    nominal: Float[np.ndarray, "dof 10"],
+    A: Float[np.ndarray, "rows columns"],
+    b: Float[np.ndarray, " rows"],
+    bounds: Bounds,
+    constraints: tuple[Constraint, ...],
+    best: Float[np.ndarray, "dof 10"],
+) -> Float[np.ndarray, "dof 10"]:
+    r"""Links nearer to the nominal ones that meet the coefficients as well as `best`.
+
+    Minimises $\lVert A\phi - b\rVert^2 + \epsilon R(\phi)$ from `best`, R the squared distance from nominal as
+    shares of a link's size. Its minimum has an objective of at most $\phi_{best} + \epsilon R(\phi_{best})$, and
+    $\epsilon$ is what makes this `CONCESSION` higher: only what the coefficients leave open moves.
+    """
+    mass = np.maximum(nominal[:, :1], 0.1 * nominal[:, 0].mean())
+    size = np.linalg.norm(np.diff(bounds.com)[..., 0], axis=-1)[:, None]
+    scale = np.concatenate([mass, *[mass * size] * 3, *[mass * size**2] * 6], 1)
+    distance = lambda phi: float(np.sum(((phi - nominal) / scale) ** 2))
+    objective = lambda phi: float(np.sum((A @ phi.ravel() - b) ** 2))
+    room = CONCESSION * objective(best) + 1e-12 * float(b @ b)
+    root = np.sqrt(room / max(distance(best), 1e-300))
+    pulled = solve(
+        np.concatenate([A, np.diag(root / scale.ravel())]),
+        np.concatenate([b, root * (nominal / scale).ravel()]),
+        bounds,
+        constraints=constraints,
+        initial=np.stack([best, nominal]),
+        starts=2,
+    )
+    nearer = (
+        (pulled.violation == 0)
+        & np.array([objective(phi) <= objective(best) + room for phi in pulled.phi])
+        & np.array([distance(phi) < distance(best) for phi in pulled.phi])
+    )
+    return pulled.phi[np.argmin(np.where(nearer, pulled.objective, np.inf))] if nearer.any() else best
 
 
 def _described(
@@ -287,18 +349,6 @@ def _described(
     six = I_com[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     shape = phi.shape[:-1]
     return mass.reshape(shape), com.reshape(*shape, 3), six.reshape(*shape, 6)
-
-
-def _nearest(
-    phi: Float[np.ndarray, "starts dof 10"], among: np.ndarray, arm: Arm | None, bounds: Bounds
-) -> int:
-    """The start whose masses and centres of mass are nearest to the arm's, as shares of their boxes."""
-    if arm is None:
-        raise InputError("prefer='nominal' needs the arm whose parameters are nominal")
-    width = np.concatenate([np.diff(bounds.mass), np.diff(bounds.com)[..., 0]], -1)
-    of = lambda phi: np.concatenate([_described(phi)[0][..., None], _described(phi)[1]], -1)
-    distance = np.sum(((of(phi) - of(np.asarray(arm.standard))) / np.where(width > 0, width, 1)) ** 2, (1, 2))
-    return int(np.argmin(np.where(among, distance, np.inf)))
 
 
 def _spread(phi: Float[np.ndarray, "starts dof 10"]) -> dict[str, tuple[float, float]]:

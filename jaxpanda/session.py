@@ -8,7 +8,14 @@ from pathlib import Path
 
 import jax
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
 
 def start() -> None:
@@ -18,7 +25,7 @@ def start() -> None:
     """
     jax.config.update("jax_enable_x64", True)
     folder = os.environ.get("JAXPANDA_CACHE", str(Path.home() / ".cache" / "jaxpanda"))
-    if folder and jax.config.jax_compilation_cache_dir is None:
+    if folder and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 

@@ -223,34 +223,31 @@ def simulate(
     return _logged(name, time, q, qd, u, sensors or Sensors(), np.random.default_rng(seed))
 
 
-def perturbed(model: str | Path, seed: int, scale: float = 0.1) -> mujoco.MjModel:
+def perturbed(model: str | Path | mujoco.MjModel, seed: int, scale: float = 0.1) -> mujoco.MjModel:
     """The arm of an MJCF with other inertial parameters: a truth that its file does not tell.
 
     Mass and principal second moments of every body are multiplied by log-normal factors of width `scale`,
     its centre of mass moves by about `scale` radii of gyration and its principal axes turn by about `scale`
     radians, so every body remains one that could be built.
     """
-    spec = _spec(model)
-    nominal = spec.compile()
+    arm = _compiled(model)
     rng = np.random.default_rng(seed)
-    for i in range(1, nominal.nbody):
-        if nominal.body_mass[i] == 0:
+    for i in range(1, arm.nbody):
+        if arm.body_mass[i] == 0:
             continue
-        Sigma = nominal.body_inertia[i].sum() / 2 - nominal.body_inertia[i]
+        Sigma = arm.body_inertia[i].sum() / 2 - arm.body_inertia[i]
         Sigma = np.maximum(Sigma, 0) * np.exp(scale * rng.normal(size=3))
         factor = np.exp(scale * rng.normal())
-        radius = np.sqrt(nominal.body_inertia[i].mean() / nominal.body_mass[i])
-        iquat = nominal.body_iquat[i].copy()
-        mujoco.mju_quatIntegrate(iquat, rng.normal(size=3), scale)
-        body = spec.bodies[i]
-        body.explicitinertial = True
-        body.mass = factor * nominal.body_mass[i]
-        body.ipos = nominal.body_ipos[i] + scale * radius * rng.normal(size=3)
-        body.iquat = iquat
-        body.fullinertia = np.full(6, np.nan)
-        # a hair of round margin: a flat body would fail the compiler's exact check by rounding
-        body.inertia = factor * (Sigma.sum() - Sigma) + 1e-9 * Sigma.sum()
-    return spec.compile()
+        radius = np.sqrt(arm.body_inertia[i].mean() / arm.body_mass[i])
+        mujoco.mju_quatIntegrate(arm.body_iquat[i], rng.normal(size=3), scale)
+        arm.body_mass[i] *= factor
+        arm.body_ipos[i] += scale * radius * rng.normal(size=3)
+        arm.body_inertia[i] = factor * (Sigma.sum() - Sigma)
+    # MuJoCo skips the offset of a centre of mass or the turn of its axes where the compiler found none.
+    arm.body_simple[:] = 0
+    arm.body_sameframe[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+    mujoco.mj_setConst(arm, mujoco.MjData(arm))
+    return arm
 
 
 def body_inertias(
@@ -278,7 +275,7 @@ def _spec(model: str | Path) -> mujoco.MjSpec:
 
 def _compiled(model: str | Path | mujoco.MjModel) -> mujoco.MjModel:
     """A copy of a compiled model, or the model of a file or text."""
-    if isinstance(model, mujoco.MjModel):
+    if not isinstance(model, str | Path):
         compiled = copy.copy(model)
     else:
         try:

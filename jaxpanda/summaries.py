@@ -32,7 +32,8 @@ def identification(found: Any) -> Sequence[Section]:
     names = found.joint_names or [f"joint {i + 1}" for i in range(found.dof)]
     sentences = [
         f"{len(found.beta)} base parameters (rank {found.rank}, condition number "
-        f"{number(found.condition_number)}) leave {number(found.relative_error_percent)} % of the data unexplained."
+        f"{number(found.condition_number)}) leave {number(found.relative_error_percent)} % of the data "
+        "unexplained."
     ]
     if found.cross_validated_relative_error_percent is not None:
         sentences.append(
@@ -102,6 +103,15 @@ def retrieval(links: Any) -> Sequence[Section]:
         ]
         for link in document["links"]
     ]
+    mass = {name: pair for name, pair in document["spread"].items() if name.startswith("m")}
+    open_ = [[name, f"{low:.3g}", f"{high:.3g}"] for name, (low, high) in mass.items()]
+    sentences.append(
+        f"{document['as_good']} starts are as good as the best (within 1 %). What differs between them is what torque "
+        "cannot tell: do not read a single mass as measured. The complete list stands in retrieval.json."
+    )
+    figures = []
+    if links.solutions is not None:
+        figures.append(outcome_figure(links.solutions.objective, document["lower_bound"]))
     heads = ["link", "m kg", "cx m", "cy m", "cz m", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"]
     return [
         Section(
@@ -111,9 +121,11 @@ def retrieval(links: Any) -> Sequence[Section]:
                 Table(
                     heads,
                     rows,
-                    "In each link's modified Denavit-Hartenberg frame; inertia about the centre of mass [kg m²]",
-                )
+                    "In each link's modified Denavit-Hartenberg frame; inertia about the com [kg m²]",
+                ),
+                Table(["mass", "least kg", "most kg"], open_, "Over the starts that are as good as the best"),
             ],
+            figures,
         )
     ]
 
@@ -140,7 +152,8 @@ def validation(checked: Any) -> Sequence[Section]:
     document = checked.to_json()
     sentences = [
         "Largest difference of inverse dynamics on the recorded states: kernel against MuJoCo "
-        f"{number(document['kernel_vs_mujoco'], 2)} N m, MJX against MuJoCo {number(document['mjx_vs_mujoco'], 2)} N m.",
+        f"{number(document['kernel_vs_mujoco'], 2)} N m, MJX against MuJoCo "
+        f"{number(document['mjx_vs_mujoco'], 2)} N m.",
         f"Torque error on the recording: {number(document['relative_error_percent'])} %.",
         *document.get("notes", []),
     ]
@@ -148,7 +161,16 @@ def validation(checked: Any) -> Sequence[Section]:
     if document.get("rollout_rmse_rad"):
         columns["tracking in MJX, rmse [rad]"] = document["rollout_rmse_rad"]
     names = document.get("joints") or [f"joint {i + 1}" for i in range(len(document["rmse"]))]
-    return [Section("Validation", sentences, [_by_joint("", names, columns)])]
+    figures = [
+        torque_figure(
+            one.times,
+            {"measured": one.measured, "model": one.modelled},
+            names,
+            f"{one.name}: measured torque and the model's, both below {checked.cutoff:g} Hz, and their difference",
+        )
+        for one in checked.torque
+    ]
+    return [Section("Validation", sentences, [_by_joint("", names, columns)], figures)]
 
 
 def _by_joint(caption: str, names: Sequence[str], columns: Mapping[str, Any]) -> Table:

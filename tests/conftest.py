@@ -6,7 +6,6 @@ from pathlib import Path
 import jax
 import pytest
 
-
 jax.config.update("jax_enable_x64", True)
 
 

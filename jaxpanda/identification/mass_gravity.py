@@ -8,7 +8,6 @@ M is symmetric, so its upper triangle is stacked, once. Of the Panda this has ra
 References:
     Gaz et al., RA-L 2019, Sec. III-IV.
 """
-# pyright: reportAttributeAccessIssue=false
 
 import dataclasses
 from collections.abc import Callable
@@ -27,7 +26,7 @@ from ..arm import Arm
 from ..errors import InputError, require_x64
 from ..parameters import base_parameters
 from .regression import triangle
-from .result import RELIABLE, Identification
+from .result import RELIABLE, Identification, of_model
 
 _SYMMETRIC = 1e-6  # of the largest entry of M
 _GRAVITIES = (0.98, 1.02)  # of the given gravity, between which the data's own is looked for
@@ -237,12 +236,14 @@ def identify_mass_gravity(
         std=std,
         classical_std=std,
         covariance=covariance,
+        classical_covariance=covariance,
         rank=base.rank,
         condition_number=float(np.linalg.cond(A)),
         relative_error_percent=_percent(residual, y),
         rmse=_rms_of_gravity(residual, len(mass), arm.dof),
         cross_validated_rmse=_rms_of_gravity(held_out, len(mass), arm.dof),
         cross_validated_relative_error_percent=_percent(held_out, y),
+        known=of_model(arm),
         arm=arm.name,
         link_names=arm.link_names,
         joint_names=arm.joint_names,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..arm import KNOWN, Arm
 from ..errors import InputError
 from ..files import finite, read_json, write_json
 from ..friction import Friction
@@ -45,6 +46,8 @@ class Identification:
     """The textbook's, which takes all samples as independent."""
     covariance: Float[np.ndarray, "base base"] | None = None
     """Of which `std` is the diagonal's root."""
+    classical_covariance: Float[np.ndarray, "base base"] | None = None
+    """Of which `classical_std` is. Its inverse says how much torque a change of the coefficients moves."""
     friction: Friction | None = None
     """Beyond what the arm's model already holds."""
     standard: Float[np.ndarray, "dof 10"] | None = None
@@ -61,6 +64,8 @@ class Identification:
     cross_validated_relative_error_percent: float | None = None
     noise: Float[np.ndarray, " dof"] | None = None
     """Noise of the filtered torque [N m] from a motion that repeats itself; no model can explain less."""
+    known: Mapping[str, Float[np.ndarray, " dof"]] = dataclasses.field(default_factory=dict)
+    """What the arm's model held beyond rigid links (`jaxpanda.arm.KNOWN`) and was not fitted."""
     arm: str = ""
     link_names: tuple[str, ...] = ()
     joint_names: tuple[str, ...] = ()
@@ -113,6 +118,7 @@ class Identification:
             "cross_validated_rmse": _listed(self.cross_validated_rmse),
             "cross_validated_relative_error_percent": self.cross_validated_relative_error_percent,
             "noise": _listed(self.noise),
+            "known": {name: values.tolist() for name, values in self.known.items()},
             "links": list(self.link_names),
             "joints": list(self.joint_names),
             "recordings": list(self.recordings),
@@ -121,6 +127,9 @@ class Identification:
             "notes": list(self.notes),
             "standard": None if self.standard is None else self.standard.tolist(),
             "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "classical_covariance": None
+            if self.classical_covariance is None
+            else self.classical_covariance.tolist(),
         }
 
     def save(self, folder: str | Path) -> Path:
@@ -178,6 +187,7 @@ class Identification:
             std=std,
             classical_std=_column(rows, "classical_std", where),
             covariance=read.array("covariance", (n, n)),
+            classical_covariance=read.array("classical_covariance", (n, n)),
             friction=Friction.from_json(friction, where=f"{where}: friction") if friction else None,
             standard=read.array("standard", (dof, 10)),
             rank=None if (rank := read.number("rank")) is None else int(rank),
@@ -187,6 +197,7 @@ class Identification:
             cross_validated_rmse=read.array("cross_validated_rmse", (dof,)),
             cross_validated_relative_error_percent=read.number("cross_validated_relative_error_percent"),
             noise=read.array("noise", (dof,)),
+            known=known_physics(read.table("known"), dof, where),
             arm=str(read.get("arm", "")),
             link_names=links,
             joint_names=joints,
@@ -195,6 +206,19 @@ class Identification:
             repairs=read.table("repairs"),
             notes=read.names("notes"),
         )
+
+
+def known_physics(table: Mapping[str, Any], dof: int, where: str) -> dict[str, Float[np.ndarray, " dof"]]:
+    """The field `known` of a file: one number a joint for each name of `jaxpanda.arm.KNOWN`, or nothing."""
+    reader = _Reader(table, f"{where}: known")
+    if table and set(table) != set(KNOWN):
+        raise InputError(f"{where}: known holds {', '.join(table)}; {', '.join(KNOWN)} are expected")
+    return {name: values for name in table if (values := reader.array(name, (dof,))) is not None}
+
+
+def of_model(arm: Arm) -> dict[str, Float[np.ndarray, " dof"]]:
+    """What a model holds beyond rigid links, by name."""
+    return {name: np.asarray(getattr(arm, name)) for name in KNOWN}
 
 
 def _listed(values: np.ndarray | None) -> list[float]:

@@ -18,7 +18,7 @@ from ..recordings import Recording
 from ..signals import Signals, blocks_many, prepare, repeatability
 from .one_step import PRIOR, Prior, feasible_least_squares
 from .regression import Fit, Masks, Regression, everything, excited, least_squares, regression, triangle
-from .result import RELIABLE, Identification
+from .result import RELIABLE, Identification, of_model
 from .sigmoid import Shape, fit_shape, linearised, with_shape
 from .statistics import covariances, determined
 
@@ -215,7 +215,7 @@ def _result(
 ) -> Identification:
     fit, base, regressions = solved.fit, problem.base, solved.regressions
     beta = fit.x[: base.rank]
-    covariance, std, textbook = _uncertainty(problem, solved)
+    robust, classical, std, textbook = _uncertainty(problem, solved)
     e = np.concatenate([r.residual(fit.x) for r in regressions], 1)
     unseen = unseen_percent = None
     if held_out is not None:
@@ -239,7 +239,8 @@ def _result(
         expressions=tuple(base.expressions),
         std=std[: base.rank],
         classical_std=textbook[: base.rank],
-        covariance=covariance[: base.rank, : base.rank],
+        covariance=robust[: base.rank, : base.rank],
+        classical_covariance=classical[: base.rank, : base.rank],
         friction=_friction(problem, solved, std, arm.dof),
         standard=fit.phi,
         rank=base.rank,
@@ -249,6 +250,7 @@ def _result(
         cross_validated_rmse=None if unseen is None else np.sqrt(np.mean(unseen**2, 1)),
         cross_validated_relative_error_percent=unseen_percent,
         noise=np.sqrt(np.mean(np.square(floors), 0)) if floors else None,
+        known=of_model(arm),
         arm=arm.name,
         link_names=arm.link_names,
         joint_names=arm.joint_names,
@@ -261,8 +263,10 @@ def _result(
 
 def _uncertainty(
     problem: _Problem, solved: _Solved
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Robust covariance, its deviations, and the textbook's; infinite where the data do not tell."""
+) -> tuple[
+    Float[np.ndarray, "n n"], Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]
+]:
+    """Robust and textbook covariance, and the deviations of each; infinite where the data do not tell."""
     regressions, x = solved.regressions, solved.fit.x
     if solved.shape is not None:
         phi1 = x[problem.base.rank :]
@@ -272,7 +276,7 @@ def _uncertainty(
     robust, classical = covariances(regressions, x, solved.fit.sigma)
     known = determined(regressions, solved.fit.sigma)
     std, textbook = (np.where(known, np.sqrt(np.diag(C)), np.inf) for C in (robust, classical))
-    return robust, std, textbook
+    return robust, classical, std, textbook
 
 
 def _friction(problem: _Problem, solved: _Solved, std: Float[np.ndarray, " n"], dof: int) -> Friction | None:

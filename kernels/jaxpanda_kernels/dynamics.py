@@ -124,7 +124,9 @@ def mass_matrix(
 ) -> Float[Array, "dof dof"]:
     """$M(q)$ [kg m²]: column j is the torque of a unit acceleration of joint j, without gravity."""
     zero = jnp.zeros_like(q)
-    columns = jax.vmap(lambda e: rnea(_floating(chain, q), phi, q, zero, e))(jnp.eye(q.shape[0], dtype=q.dtype))
+    columns = jax.vmap(lambda e: rnea(_floating(chain, q), phi, q, zero, e))(
+        jnp.eye(q.shape[0], dtype=q.dtype)
+    )
     return 0.5 * (columns + columns.T)
 
 
@@ -148,7 +150,7 @@ def coriolis_matrix(
 ) -> Float[Array, "dof dof"]:
     r"""$C(q, \dot q)$ of the Christoffel symbols, for which $\dot M - 2C$ is skew-symmetric.
 
-    $$C_{ij} = \tfrac12 \sum_k \left(\partial_k M_{ij} + \partial_j M_{ik} - \partial_i M_{jk}\right)\dot q_k$$
+    $$C_{ij} = \tfrac12 \sum_k (\partial_k M_{ij} + \partial_j M_{ik} - \partial_i M_{jk})\,\dot q_k$$
 
     Many matrices give the same torque; take `coriolis_torque` where only that is needed.
     """

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-
 # Where each of Ixx, Ixy, Iyy, Ixz, Iyz, Izz stands in the symmetric 3x3 matrix.
 _ROW = np.array([0, 0, 1, 0, 1, 2])
 _COLUMN = np.array([0, 1, 1, 2, 2, 2])
@@ -96,13 +95,9 @@ def triangle_margin(phi: Float[Array, "10"]) -> Float[Array, ""]:
     return jnp.linalg.eigvalsh(second_moment(I_com))[0]
 
 
-def move(
-    phi: Float[Array, "10"], R_ab: Float[Array, "3 3"], p_ab: Float[Array, "3"]
-) -> Float[Array, "10"]:
+def move(phi: Float[Array, "10"], R_ab: Float[Array, "3 3"], p_ab: Float[Array, "3"]) -> Float[Array, "10"]:
     """`phi` of the same body in frame a, given it in frame b, whose pose in a is (`R_ab`, `p_ab`)."""
-    X = jnp.block(
-        [[R_ab, p_ab[:, None]], [jnp.zeros((1, 3), phi.dtype), jnp.ones((1, 1), phi.dtype)]]
-    )
+    X = jnp.block([[R_ab, p_ab[:, None]], [jnp.zeros((1, 3), phi.dtype), jnp.ones((1, 1), phi.dtype)]])
     return from_pseudo_inertia(X @ pseudo_inertia(phi) @ X.T)
 
 

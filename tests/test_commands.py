@@ -1,0 +1,161 @@
+"""The commands: what they leave, what they print, and how they refuse."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxpanda.__main__ import main
+from jaxpanda.recordings import save
+from jaxpanda.recordings.recording import Recording
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    """Four seconds of the virtual Panda."""
+    from jaxpanda.demo import record
+
+    path = tmp_path_factory.mktemp("recordings") / "arm.csv"
+    log = record(seed=3, duration=4.0).recording
+    save(log, path)
+    return path
+
+
+def refused(capsys, *arguments: str) -> str:
+    """The one line that a refused command leaves on standard error."""
+    assert main(list(arguments)) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("jaxpanda: ")
+    assert err.count("\n") == 1
+    return err
+
+
+def test_help_needs_no_jax():
+    code = (
+        "import sys; sys.argv = ['jaxpanda', '--help']\n"
+        "from jaxpanda.__main__ import main\n"
+        "try: main()\n"
+        "except SystemExit as stop: assert not stop.code\n"
+        "assert not {'jax', 'numpy', 'mujoco', 'scipy'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "identify" in done.stdout
+
+
+def test_every_public_name_resolves():
+    import jaxpanda
+
+    for name in dir(jaxpanda):
+        assert getattr(jaxpanda, name) is not None
+    with pytest.raises(AttributeError, match="identify"):
+        jaxpanda.identity  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["inspect"],
+        ["inspekt"],
+        ["inspect", "--recordin", "a.csv"],
+        ["demo", "--out", "d", "--starts", "many"],
+    ],
+)
+def test_bad_usage_is_one_line_and_status_2(capsys, arguments):
+    assert "--help" in refused(capsys, *arguments)
+
+
+def test_inspect_prints_one_json_document_and_nothing_else(capsys, recording):
+    assert main(["inspect", "--recording", str(recording), "--json"]) == 0
+    out, _ = capsys.readouterr()
+    (one,) = json.loads(out)["recordings"]
+    assert one["dof"] == 7
+    assert one["rate"] == pytest.approx(1000, rel=1e-3)
+
+
+def test_the_chain_of_commands_leaves_what_the_interface_promises(capsys, recording, tmp_path):
+    run, model = tmp_path / "run", tmp_path / "found.xml"
+    assert main(["identify", "--recording", str(recording), "--out", str(run), "--folds", "0"]) == 0
+    found = json.loads((run / "identification.json").read_text())
+    assert found["schema"] == "jaxpanda.identification/1"
+    assert found["method"] == "trajectory"
+    assert len(found["coefficients"]) == found["rank"]
+    assert len(found["friction"]) == 7
+
+    file = str(run / "identification.json")
+    assert main(["retrieve", "--identification", file, "--starts", "8", "--out", str(run)]) == 0
+    links = json.loads((run / "retrieval.json").read_text())
+    assert links["max_violation"] == 0
+    assert len(links["links"]) == 7
+
+    assert main(["export", "--retrieval", str(run), "--out", str(model)]) == 0
+    assert main(["export", "--retrieval", str(run), "--out", str(tmp_path / "found.urdf")]) == 0
+    capsys.readouterr()
+    assert (
+        main(["validate", "--model", str(model), "--recording", str(recording), "--out", str(run), "--json"])
+        == 0
+    )
+    out, _ = capsys.readouterr()
+    checked = json.loads(out)
+    assert checked == json.loads((run / "validation.json").read_text())
+    assert checked["kernel_vs_mujoco"] < 1e-9
+    assert checked["mjx_vs_mujoco"] < 1e-9
+    assert checked["relative_error_percent"] < 5
+    assert max(checked["rollout_rmse_rad"]) < 0.2
+
+
+def test_a_failed_stage_leaves_nothing(capsys, recording, tmp_path):
+    text = recording.read_text().splitlines()
+    cells = text[50].split(",")
+    cells[4] = "nan"
+    text[50] = ",".join(cells)
+    bad = tmp_path / "bad.csv"
+    bad.write_text("\n".join(text))
+    line = refused(capsys, "identify", "--recording", str(bad), "--out", str(tmp_path / "new" / "run"))
+    assert "bad.csv" in line
+    assert "q_4" in line
+    assert "50" in line or "51" in line
+    assert not (tmp_path / "new").exists()
+
+
+def test_files_that_are_nobodys_are_refused(capsys, recording, tmp_path):
+    garbage = tmp_path / "garbage.csv"
+    garbage.write_bytes(bytes(range(256)) * 8)
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<mujoco><worldbody><body></worldbody></mujoco>")
+    text = tmp_path / "note.json"
+    text.write_text('{"coefficients": "none"}')
+    out = str(tmp_path / "out")
+    missing = str(tmp_path / "missing.csv")
+    for arguments, word in [
+        (["inspect", "--recording", missing], "missing.csv"),
+        (["inspect", "--recording", str(garbage)], "garbage.csv"),
+        (["inspect", "--recording", str(recording), "--model", str(broken)], "broken.xml"),
+        (
+            ["identify", "--recording", str(recording), "--mass-gravity", str(garbage), "--out", out],
+            "one of the two",
+        ),
+        (["identify", "--mass-gravity", str(garbage), "--out", out], "garbage.csv"),
+        (["identify", "--recording", str(recording), "--out", str(garbage)], "garbage.csv"),
+        (["retrieve", "--identification", str(text), "--out", out], "note.json"),
+        (["retrieve", "--identification", missing, "--out", out], "missing.csv"),
+        (["export", "--retrieval", str(tmp_path), "--out", out], "retrieval.json"),
+        (["validate", "--model", str(broken), "--recording", str(recording), "--out", out], "broken.xml"),
+    ]:
+        assert word in refused(capsys, *arguments), arguments
+        assert not Path(out).exists()
+
+
+def test_a_recording_of_another_arm_is_refused(capsys, tmp_path):
+    time = np.arange(2000) / 500
+    other = tmp_path / "six.csv"
+    wave = np.sin(time[:, None] + np.arange(6))
+    save(Recording("six.csv", time, wave, None, wave), other)
+    line = refused(capsys, "identify", "--recording", str(other), "--out", str(tmp_path / "run"))
+    assert "six.csv" in line
+    assert "6 joints" in line
