@@ -84,7 +84,8 @@ def retrieval(links: Any) -> Sequence[Section]:
     document = links.to_json()
     best = document["objective"]
     sentences = [
-        f"The best of {document['starts']} random starts misses the coefficients by phi = {best:.6g}; "
+        f"The best of {document['starts']} random starts misses the coefficients by phi = {best:.6g}"
+        f"{' (weighed by torque, in variances of a sample)' if document['weighting'] == 'torque' else ''}; "
         f"largest violation of any constraint {document['max_violation']:.2g}; "
         f"total mass {document['total_mass']:.2f} kg."
     ]
@@ -106,8 +107,8 @@ def retrieval(links: Any) -> Sequence[Section]:
     mass = {name: pair for name, pair in document["spread"].items() if name.startswith("m")}
     open_ = [[name, f"{low:.3g}", f"{high:.3g}"] for name, (low, high) in mass.items()]
     sentences.append(
-        f"{document['as_good']} starts are as good as the best (within 1 %). What differs between them is what torque "
-        "cannot tell: do not read a single mass as measured. The complete list stands in retrieval.json."
+        f"{document['as_good']} starts are as good as the best (within 1 %). What differs between them is what "
+        "torque cannot tell: do not read a single mass as measured. The complete list stands in retrieval.json."
     )
     figures = []
     if links.solutions is not None:
@@ -166,7 +167,7 @@ def validation(checked: Any) -> Sequence[Section]:
             one.times,
             {"measured": one.measured, "model": one.modelled},
             names,
-            f"{one.name}: measured torque and the model's, both below {checked.cutoff:g} Hz, and their difference",
+            f"{one.name}: measured torque and the model's, both below {checked.cutoff:g} Hz, and what is left",
         )
         for one in checked.torque
     ]
