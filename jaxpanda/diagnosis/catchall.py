@@ -9,17 +9,15 @@ from .library import Candidates, columns_of
 from .traces import Trace
 
 
-_KNOTS = {"odd in dq": 8, "even in dq": 8, "of q": 10, "of t": 10, "friction of q": 9, "friction of t": 6}
+_KNOTS = {"odd in dq": 8, "even in dq": 8, "of q": 10, "friction of q": 9}
 _FEW = 6
 _KINDS = {
     "odd in dq": lambda m, j: np.abs(m.qd[:, j]),
     "even in dq": lambda m, j: np.abs(m.qd[:, j]),
     "of q": lambda m, j: m.q[:, j],
     "of load": lambda m, j: m.load[:, j],
-    "of t": lambda m, j: m.time,
     "friction of q": lambda m, j: m.q[:, j],
     "friction of load": lambda m, j: np.abs(m.load[:, j]),
-    "friction of t": lambda m, j: m.time,
     "of ddq": lambda m, j: m.qdd[:, j],
     "of q_k": lambda m, j: m.q[:, j],
     "odd in dq_k": lambda m, j: np.abs(m.qd[:, j]),

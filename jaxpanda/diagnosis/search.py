@@ -19,9 +19,9 @@ ACCEPT = 9.0
 """Evidence that an effect needs, its search over shapes paid for [nats]."""
 SWAP = 3.0
 """Evidence that another effect must win by to take an accepted one's place [nats]."""
-SHADOW = 0.004
+SHADOW, EVENT_SHADOW = 0.012, 0.06
 """Share of the strongest term's evidence below which others are taken for its shadows: for what its shape, which is
-never quite right, leaves over."""
+never quite right, leaves over. Events in time, which fit any such leftover somewhere, need a larger share."""
 UNKNOWN_MARGIN, UNKNOWN_SHARE = 10.0, 0.06
 """What a free form must win by [nats, share]."""
 MOST_TERMS = 5
@@ -56,11 +56,17 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
     while len(state.terms) < MOST_TERMS:
         proposals = ranked(problem, state.design, state.noise)
         say(f"{len(state.terms)} terms: " + describe(proposals[:6]))
-        if not proposals or proposals[0].evidence < max(ACCEPT, SHADOW * strongest):
+        worthy = [p for p in proposals if p.evidence >= floor(p.effect, strongest)]
+        if not worthy:
             break
-        strongest = max(strongest, proposals[0].evidence)
-        state = with_terms(problem, (*state.terms, problem.term(proposals[0].effect, proposals[0].deviation)))
+        state = with_terms(problem, (*state.terms, problem.term(worthy[0].effect, worthy[0].deviation)))
+        strongest = max(strongest, worthy[0].evidence, gain(problem, state, -1))
     return contest(problem, prune(problem, swap(problem, prune(problem, state, say), say), say), say)
+
+
+def floor(effect: AbstractEffect, strongest: float) -> float:
+    """Evidence that an effect needs beside a stronger one [nats]."""
+    return max(ACCEPT, (EVENT_SHADOW if effect.bound_to_recording else SHADOW) * strongest)
 
 
 def contest(problem: Problem, state: State, say: Any) -> State:
@@ -93,9 +99,6 @@ def swap(problem: Problem, state: State, say: Any) -> State:
                 say(f"swap {state.terms[i].key} for " + describe([best]))
             terms = list(state.terms)
             terms[i] = problem.term(best.effect, best.deviation)
-            if len({t.key for t in terms}) < len(terms):
-                terms = [t for k, t in enumerate(terms) if k == i or t.key != best.key]
-                return with_terms(problem, terms)
             state = with_terms(problem, terms)
     return state
 
@@ -104,9 +107,9 @@ def prune(problem: Problem, state: State, say: Any) -> State:
     """Drop terms that the others have made needless, the weakest first."""
     while state.terms:
         gains = [gain(problem, state, i) for i in range(len(state.terms))]
-        weakest = int(np.argmin(gains))
-        floor = max(ACCEPT, SHADOW * max(gains))
-        if gains[weakest] >= floor:
+        lacking = [g - floor(t.effect, max(gains)) for g, t in zip(gains, state.terms, strict=True)]
+        weakest = int(np.argmin(lacking))
+        if lacking[weakest] >= 0:
             break
         say(f"prune {state.terms[weakest].key}: {gains[weakest]:.1f}")
         state = with_terms(problem, (*state.terms[:weakest], *state.terms[weakest + 1 :]))
@@ -115,7 +118,7 @@ def prune(problem: Problem, state: State, say: Any) -> State:
 
 def gain(problem: Problem, state: State, i: int) -> float:
     """Evidence of a term beside the others [nats]."""
-    others = (*state.terms[:i], *state.terms[i + 1 :])
+    others = [t for t in state.terms if t is not state.terms[i]]
     return state.design.log_evidence - problem.design(others, state.noise).log_evidence
 
 

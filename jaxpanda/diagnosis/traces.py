@@ -26,6 +26,8 @@ POSITION_CUTOFF = 12.0
 """Low-pass of q before it is differentiated, at most [Hz]."""
 _LEAST_CUTOFF = 5.0
 _TRIM = 0.4
+_GAP, _NEAR = 3.5, 0.04
+"""Missing steps that make a gap, and how far beyond it samples do not count [s]."""
 _PARABOLA = 0.12
 """At the ends of a recording, over which q is taken for a parabola to continue it [s]."""
 _SOLREF, _IMPEDANCE_LEAST, _IMPEDANCE_MOST = 0.02, 0.9, 0.95
@@ -106,8 +108,31 @@ def prepare(
     if stride > thin:
         load = scipy.interpolate.CubicSpline(motion.time, load)(np.clip(time[fine], *motion.time[[0, -1]]))
     channels = Channels(time[fine], q[fine], qd[fine], qdd[fine], load, load + held_fine)
-    weight = (_distance(recording.time, time[keep]) < 2.5 / rate).astype(float)
+    weight = _weight(recording.time, time[keep], rate)
     return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff)
+
+
+def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):
+    """`signals.derivatives`, with q continued beyond its ends as parabolas: an arm may be cut off in motion."""
+    count = min(max(8, round(_PARABOLA * rate)), len(q))
+    more = max(4, round(0.4 * rate))
+    x = np.arange(count) / rate
+    ends = []
+    for part, at in ((q[:count], -np.arange(more, 0, -1) / rate), (q[-count:], x[-1] + np.arange(1, more + 1) / rate)):
+        fitted = np.polynomial.polynomial.polyfit(x, part, 2)
+        ends.append(np.polynomial.polynomial.polyval(at, fitted).T)
+    longer = signals_.derivatives(np.concatenate([ends[0], q, ends[1]]), cutoff, rate)
+    return tuple(part[more:-more] for part in longer)
+
+
+def _weight(
+    rows: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " time"], rate: float
+) -> Float[np.ndarray, " time"]:
+    """0 near gaps, where the filters spread what interpolation made up."""
+    weight = np.ones(len(grid))
+    for k in np.flatnonzero(np.diff(rows) > _GAP / rate):
+        weight[(grid > rows[k] - _NEAR) & (grid < rows[k + 1] + _NEAR)] = 0.0
+    return weight
 
 
 def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):

@@ -143,28 +143,34 @@ class TorqueRipple(AbstractInstantEffect):
 class JointElasticity(AbstractArmEffect):
     r"""Compliance between the position sensor and the link.
 
-    $$q_{link} = q_j - \tau_j / K_j, \qquad
-      \Delta\tau = \frac{\partial\tau}{\partial q}\Delta q + \frac{\partial\tau}{\partial \dot q}\Delta\dot q
-        + M\,\Delta\ddot q, \qquad \Delta q = -\tau_j / K_j$$
+    $$\tau(q + \delta) = -K\,\delta, \qquad
+      \delta(\omega) \approx \frac{-\tau(q)(\omega)}{K - \bar M_{jj}\omega^2 + 2 i \zeta \omega \sqrt{K \bar M_{jj}}}$$
 
-    to first order in the compliance $1/K$. $\tau_j$ is the nominal torque, smoothed, since its second derivative
-    would otherwise be made of the same noise as the residual.
+    The link swings on its spring, which near its resonance is far from $-\tau/K$; the columns are
+    $K\,(\tau(q + \delta) - \tau(q))$, so that the coefficient is the compliance where `stiffness` is right. $\delta$
+    is low-passed: its second derivative would otherwise be made of the same noise as the residual.
 
     References:
         Spong, ASME JDSMC 1987; Madsen et al., Math. Probl. Eng. 2020.
     """
 
     name: ClassVar[str] = "joint_elasticity"
-    reveals: ClassVar[str] = (
-        "heavy and light load in the same pose; bursts of high frequency; both encoders, if any"
-    )
-    confounded_with: ClassVar[tuple[str, ...]] = ("encoder_offset", "time_delay", "backlash")
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("stiffness", "N·m/rad", 50.0, 1e6),)
+    reveals: ClassVar[str] = "heavy and light load in the same pose; bursts of high frequency; both encoders, if any"
+    confounded_with: ClassVar[tuple[str, ...]] = ("encoder_offset", "time_delay", "backlash", "inertial_parameters")
 
     joint: Joint
+    stiffness: Float[Array, ""] | float
+    damping_ratio: Float[Array, ""] | float
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["JointElasticity"]:
-        return [cls(j) for j in range(arm.dof)]
+        return [
+            cls(j, K, zeta)
+            for K in (300.0, 600.0, 1200.0, 3000.0, 15000.0)
+            for zeta in ((0.1, 0.3) if K < 1000 else (0.2,))
+            for j in range(arm.dof)
+        ]
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -179,9 +185,19 @@ class JointElasticity(AbstractArmEffect):
         return "q_link = q - compliance * tau"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        j, K, zeta = int(self.joint), float(self.stiffness), float(self.damping_ratio)
+        inertia = max(motion.mean_inertia[j], 1e-6)
+        load = np.concatenate([motion.load[:, j], motion.load[::-1, j]])  # mirrored: no step from end to start
+        w = 2 * np.pi * np.fft.rfftfreq(len(load), motion.dt)
+        spring = 1 - w**2 * inertia / K + 2j * zeta * w * np.sqrt(inertia / K)
+        smooth = 1 / (1 + (w / (2 * np.pi * _DEFLECTION_CUTOFF)) ** 4)
         dq = np.zeros_like(motion.q)
-        dq[:, int(self.joint)] = -motion.load[:, int(self.joint)]
-        return motion.sensitivity(dq)[..., None]
+        dq[:, j] = -np.fft.irfft(np.fft.rfft(load) * smooth / spring, len(load))[: motion.samples] / K
+        return K * (motion.moved(dq).load - motion.load)[..., None]
+
+
+_DEFLECTION_CUTOFF = 6.0
+"""Low-pass of a joint's deflection [Hz]."""
 
 
 class Backlash(AbstractArmEffect):
@@ -231,7 +247,7 @@ class Backlash(AbstractArmEffect):
                 state = min(1.0, max(-1.0, state + moved))
                 p[i] = state
         else:
-            p = np.tanh(motion.load[:, j] / (b * 500.0))
+            p = np.tanh(motion.load[:, j] / (b * 100.0))
         dq = np.zeros_like(motion.q)
         dq[:, j] = -p
         return motion.sensitivity(dq)[..., None]

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxpanda_kernels import link_poses, regressor, rnea
+from jaxpanda_kernels import link_poses, mass_matrix, regressor, rnea
 from jaxtyping import Array, Float, Int
 
 from ..arm import Arm
@@ -83,10 +83,11 @@ class Motion:
         return self._over(_link_axes, self.q)
 
     @functools.cached_property
-    def load_rates(self) -> tuple[Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"]]:
-        """First and second derivative in time of `load` [N m/s, N m/s²]."""
-        rate = np.gradient(self.load, self.dt, axis=0)
-        return rate, np.gradient(rate, self.dt, axis=0)
+    def mean_inertia(self) -> Float[np.ndarray, " dof"]:
+        """What each joint turns, in the mean over some poses of the motion [kg m²]."""
+        poses = self.q[:: max(1, self.samples // 16)][:16]
+        poses = np.concatenate([poses, np.repeat(poses[-1:], 16 - len(poses), 0)])
+        return np.asarray(_inertias(self.arm, poses)).mean(0)
 
     def sensitivity(self, dq: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, "time dof"]:
         """Change of the smooth torque [N m] for a small change `dq(t)` of the joint positions, to first order."""
@@ -147,6 +148,11 @@ def _sensitivity(arm, q, qd, qdd, dq, dqd, dqdd):
         return jax.jvp(lambda *s: _smooth(arm, *s), (q, qd, qdd), (dq, dqd, dqdd))[1]
 
     return jax.vmap(one)(q, qd, qdd, dq, dqd, dqdd)
+
+
+@jax.jit
+def _inertias(arm, q):
+    return jax.vmap(lambda q: jnp.diag(mass_matrix(arm.chain, arm.standard, q)) + arm.armature)(q)
 
 
 @jax.jit

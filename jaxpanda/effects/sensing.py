@@ -76,8 +76,8 @@ class TorqueGain(AbstractInstantEffect):
 class TorqueDrift(AbstractInstantEffect):
     r"""Bias of a torque sensor that changes over time, $\tau_j = a\,g(t) + b$ with $g = 1 - e^{-t/T}$.
 
-    A long time constant is a linear trend. Form "... extra" is without the constant; "wave" is
-    $a \sin(2\pi t/T) + b \cos(2\pi t/T)$, a bias that wanders.
+    A long time constant is a linear trend. Form "extra" is without the constant; "wave" is
+    $a\,t + b + s \sin(2\pi t/T) + c \cos(2\pi t/T)$, a bias that wanders; "wandering" adds half the period to it.
     """
 
     name: ClassVar[str] = "torque_drift"
@@ -92,36 +92,36 @@ class TorqueDrift(AbstractInstantEffect):
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["TorqueDrift"]:
-        shapes = [("extra", T) for T in (2.0, 6.0, 20.0, 500.0)] + [
-            ("offset", T) for T in (2.0, 6.0, 20.0, 500.0)
-        ]
-        shapes += [("wave", T) for T in (10.0, 20.0, 40.0)]
+        shapes = [(form, T) for form in ("extra", "offset") for T in (2.0, 6.0, 20.0, 500.0)]
+        shapes += [(form, T) for form in ("wave", "wandering") for T in (6.0, 10.0, 16.0, 30.0, 60.0)]
         return [cls(j, T, form) for form, T in shapes for j in range(arm.dof)]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        if self.form == "wave":
-            return (Coefficient("sine", "N·m"), Coefficient("cosine", "N·m"))
-        change = Coefficient("change", "N·m")
-        return (change,) if self.form == "extra" else (change, Coefficient("offset", "N·m"))
+        change, offset = Coefficient("change", "N·m"), Coefficient("offset", "N·m")
+        wave = Coefficient("trend", "N·m/s"), offset, Coefficient("sine", "N·m"), Coefficient("cosine", "N·m")
+        half = Coefficient("sine_2", "N·m"), Coefficient("cosine_2", "N·m")
+        forms = {"extra": (change,), "offset": (change, offset), "wave": wave, "wandering": (*wave, *half)}
+        return forms[self.form]
 
     @property
     def equation(self) -> str:
-        return (
-            "tau = "
-            + {
-                "extra": "change * (1 - exp(-t / time_constant))",
-                "offset": "offset + change * (1 - exp(-t / time_constant))",
-                "wave": "sine * sin(2 pi t / time_constant) + cosine * cos(2 pi t / time_constant)",
-            }[self.form]
-        )
+        wave = "offset + trend * t + sine * sin(w t) + cosine * cos(w t)"
+        return "tau = " + {
+            "extra": "change * (1 - exp(-t / time_constant))",
+            "offset": "offset + change * (1 - exp(-t / time_constant))",
+            "wave": f"{wave}, w = 2 pi / time_constant",
+            "wandering": f"{wave} + sine_2 * sin(2 w t) + cosine_2 * cos(2 w t), w = 2 pi / time_constant",
+        }[self.form]
 
     def at(self, s: Channels) -> Float[Array, " n"]:
-        phase = s.t / self.time_constant
-        if self.form == "wave":
-            return jnp.stack([jnp.sin(2 * jnp.pi * phase), jnp.cos(2 * jnp.pi * phase)])
+        one, phase = jnp.ones_like(s.t), s.t / self.time_constant
+        if self.form in ("wave", "wandering"):
+            w = 2 * jnp.pi * phase
+            wave = [s.t, one, jnp.sin(w), jnp.cos(w)]
+            return jnp.stack(wave if self.form == "wave" else [*wave, jnp.sin(2 * w), jnp.cos(2 * w)])
         g = -jnp.expm1(-phase)
-        return jnp.stack([g] if self.form == "extra" else [g, jnp.ones_like(g)])
+        return jnp.stack([g] if self.form == "extra" else [g, one])
 
 
 class TorqueCrosstalk(AbstractInstantEffect):
@@ -212,7 +212,7 @@ class TimeDelay(AbstractArmEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("delay", "s", sign=1 if self.around > 0 else -1),)
+        return (Coefficient("delay", "s"),)
 
     @property
     def equation(self) -> str:
