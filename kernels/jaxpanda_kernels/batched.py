@@ -35,15 +35,18 @@ def _geometry(chain: Chain | Geometry, *states: Float[Array, "*samples dof"]) ->
 
 
 def _columns(x: Float[Array, "*samples dof"]) -> list[Float[Array, " filled"]]:
-    """An array for each joint, and a sample at rest where that makes their number odd.
+    """An array for each joint, filled up with samples at rest to a number that XLA compiles well.
 
-    XLA on GPUs lets each thread compute four samples, or two, where their number can be divided so;
-    kernels as long as these then run out of registers, in float64 at half the speed.
+    On CPUs it vectorises over samples only as far as their number can be divided: an odd one costs a factor of
+    two to four. On GPUs that makes each thread compute four samples, or two; kernels as long as these then run
+    out of registers, in float64 at half the speed: there the number is made odd.
     """
 
     def transposed(x):
         rows = x.reshape(-1, x.shape[-1])
-        return jnp.pad(rows, ((0, 1 - rows.shape[0] % 2), (0, 0))).T
+        count = rows.shape[0]
+        missing = -count % 8 if jax.default_backend() == "cpu" else 1 - count % 2
+        return jnp.pad(rows, ((0, missing), (0, 0))).T
 
     return list(alone(transposed, x))
 
@@ -98,8 +101,8 @@ def entries(
     """Entries of the regressor that are not zero for every motion, a column of samples each.
 
     As `columns.regressor`, in programs that compile and run well: on a CPU one, joints, motions and rows
-    after each other; on a GPU several (outside `jit`), each of a few entries, from the states. There an odd
-    number of samples runs up to 1.7 times faster in float64, as `_columns` says.
+    after each other; on a GPU several (outside `jit`), each of a few entries, from the states. Choose the
+    number of samples as `_columns` does: a multiple of 8 on a CPU, odd on a GPU.
 
     Args:
         chain: the arm, or what `specialise` made of it.
