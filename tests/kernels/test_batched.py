@@ -231,7 +231,7 @@ def test_torque_is_compiled_into_a_few_loops_that_keep_little():
 
     @jax.jit
     def torque(phi, q, qd, qdd):
-        return columns.rnea(geometry, phi, q, qd, qdd)
+        return columns.rnea(geometry, [list(body) for body in phi], q, qd, qdd)
 
     program = torque.lower(phi, column, column, column).compile()
     entry = program.as_text().split("ENTRY")[1]
