@@ -10,7 +10,8 @@ import pytest
 from jaxpanda.errors import InputError
 from jaxpanda.feasible import Bounds
 from jaxpanda.panda import panda, published
-from jaxpanda.retrieval import Retrieval, retrieve
+from jaxpanda.parameters import coefficient_matrix
+from jaxpanda.retrieval import CONCESSION, Retrieval, retrieve
 
 OPTIMUM = 3.7262e-4
 """Certified once by another modelling tool (cvxpy), gap 1e-11."""
@@ -109,13 +110,16 @@ def quick() -> dict:
     return {"starts": 64, "certificate": False, "bounds": Bounds.panda()}
 
 
-def test_weights_by_covariance_give_the_sure_coefficients_more(quick):
-    weighted = retrieve(table(), weighting="covariance", **quick)
-    rows = [row for row in published()["coefficients"] if row["reliable"]]
-    assert weighted.lower_bound is None
-    assert weighted.weighting == "covariance"
-    assert weighted.objective > 1e-2  # in variances, not in squared kg m²
-    assert min(row["std"] for row in rows) > 0
+def test_weighing_by_torque_misses_the_sure_coefficients_less(quick):
+    rows = table()["coefficients"]
+    K = coefficient_matrix([row["terms"] for row in rows], 7)
+    value, std = (np.array([row[key] for row in rows]) for key in ("value", "std"))
+    misses = {}
+    for weighting in ("none", "torque"):
+        links = retrieve(table(), weighting=weighting, prefer="best", **quick)
+        misses[weighting] = np.sum(((K @ links.standard.ravel() - value) / std) ** 2)
+    assert links.objective == pytest.approx(misses["torque"], rel=1e-9)
+    assert misses["torque"] < 0.8 * misses["none"]
 
 
 def test_a_user_constraint_holds_and_its_margin_is_reported(quick):
@@ -124,13 +128,14 @@ def test_a_user_constraint_holds_and_its_margin_is_reported(quick):
     assert kept.margins["user"][0][0] == pytest.approx(kept.links[0]["mass"] - kept.links[1]["mass"])
 
 
-def test_nominal_preference_trades_one_percent_for_nearness(quick):
+def test_links_stay_near_the_nominal_ones_in_what_the_coefficients_do_not_tell(quick):
     arm = panda()
     near = retrieve(table(), arm=arm, prefer="nominal", **quick)
-    best = retrieve(table(), **quick)
+    best = retrieve(table(), prefer="best", **quick)
     distance = lambda r: np.sum((r.standard[:, 0] - np.asarray(arm.standard[:, 0])) ** 2)
-    assert best.objective <= near.objective <= 1.01 * best.objective
-    assert distance(near) <= distance(best)
+    assert best.objective <= near.objective <= (1 + 2 * CONCESSION) * best.objective
+    assert near.max_violation == 0
+    assert distance(near) < 0.8 * distance(best)
 
 
 def test_constraints_that_no_start_meets_are_an_error(quick):
