@@ -22,7 +22,7 @@ from . import knowledge as knowledge_
 from .decide import Finding, coefficients, findings
 from .problem import Problem
 from .search import State, search
-from .traces import Trace, held_sign, prepare
+from .traces import Trace, prepare
 
 CORRECTED = "corrected.json"
 """What `predict` reads."""
@@ -272,8 +272,7 @@ def predict(folder: str | Path, motion: str | Path | Recording) -> Float[np.ndar
     recording = motion if isinstance(motion, Recording) else load(motion)
     recording.require_dof(corrected.arm.dof)
     trace = prepare(recording, corrected.arm, whole=True, noise=np.asarray(document["torque_noise"]))
-    sign = held_sign(corrected.arm, trace.motion.qd, trace.motion.qdd)
-    tau = corrected.measured_torque(trace.motion, trace.channels, sign)
+    tau = corrected.measured_torque(trace.motion, trace.channels, trace.sign)
     return scipy.interpolate.interp1d(
         trace.motion.time, tau, axis=0, fill_value="extrapolate", assume_sorted=True
     )(recording.time)

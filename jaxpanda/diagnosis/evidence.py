@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 SCALES = (1.0, 4.0, 16.0)
 """Sizes of an effect over the noise, per sample, that are expected alike."""
-PHYSICAL_SCALES = (0.1, 0.33, 1.0, 3.0)
+PHYSICAL_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Sizes over the physically plausible one, where a coefficient has such."""
 
 

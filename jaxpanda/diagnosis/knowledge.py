@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ..arm import Arm
 from ..errors import InputError
 from ..parameters import random_regressor
-from .traces import Trace, held_sign
+from .traces import Trace
 
 Knowledge = Literal["exact", "identified", "rough", "unknown"]
 
@@ -78,8 +78,7 @@ def nuisance(
         joints = np.eye(arm.dof)
         for j in np.flatnonzero(damping > 0):
             parts.append((damping[j] * trace.motion.qd)[:, :, None] * joints[:, j : j + 1])
-        c = trace.channels
-        sign = trace.down(held_sign(arm, np.asarray(c.qd), np.asarray(c.qdd)))
+        sign = trace.down(trace.sign)
         for j in np.flatnonzero(level > 0):
             parts.append((level[j] * sign)[:, :, None] * joints[:, j : j + 1])
         out.append(np.concatenate(parts, 2))

@@ -42,11 +42,14 @@ def saturated_residual(
     q, qd = stacked(lambda t: t.motion.q[:, joint]), stacked(lambda t: t.motion.qd[:, joint])
     load = stacked(lambda t: t.motion.load[:, joint])
     sign = stacked(lambda t: t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / 0.01)))
+    rates = [np.gradient(t.motion.load[:, joint], t.motion.dt) for t in traces]
+    bends = [np.gradient(rate, t.motion.dt) for rate, t in zip(rates, traces, strict=True)]
+    swings = np.stack([np.concatenate(rates), np.concatenate(bends)], 1)
     speed = hats(np.abs(qd), 8)
     clock = scipy.linalg.block_diag(*[hats(t.motion.time, 10) for t in traces])
     A = np.concatenate(
         [Q[:, :rank], hats(q, 10), speed, sign[:, None] * speed, sign[:, None] * hats(q, 4), hats(load, 5),
-         sign[:, None] * hats(load, 3), clock, sign[:, None] * clock[:, ::2], *([np.concatenate(list(extra))] if extra else [])],
+         sign[:, None] * hats(load, 3), swings, clock, sign[:, None] * clock[:, ::2], *([np.concatenate(list(extra))] if extra else [])],
         1,
     )  # fmt: skip
     w = np.concatenate([t.weight for t in traces])
@@ -55,6 +58,20 @@ def saturated_residual(
     r = stacked_residual = np.concatenate([x[:, joint] for x in residual]) * w
     left = stacked_residual - U @ (U.T @ r)
     return np.split(left, np.cumsum([t.motion.samples for t in traces])[:-1]), U.shape[1]
+
+
+def strongest_order(
+    q: Sequence[Float[np.ndarray, " time"]], left: Sequence[Float[np.ndarray, " time"]]
+) -> list[Float[np.ndarray, "time 4"]]:
+    """The order of position that takes most out of a residual, with its second harmonic, as columns."""
+    travel = max(float(np.ptp(x)) for x in q)
+    orders = np.arange(4.0, 300.0, np.pi / (2 * max(travel, 0.3)))
+    power = np.zeros(len(orders))
+    for part in np.array_split(np.arange(len(orders)), 8):
+        waves = sum(r @ np.exp(1j * np.outer(x, orders[part])) for x, r in zip(q, left, strict=True))
+        power[part] = np.abs(waves)
+    n = orders[power.argmax()]
+    return [np.stack([np.sin(n * x), np.cos(n * x), np.sin(2 * n * x), np.cos(2 * n * x)], 1) for x in q]
 
 
 def estimate(

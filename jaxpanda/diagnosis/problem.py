@@ -12,7 +12,7 @@ from ..effects import AbstractArmEffect, AbstractEffect, AbstractJointEffect
 from . import catchall
 from .evidence import Design, Noise, gram
 from .library import Candidates, build, columns_of
-from .noise import estimate
+from .noise import estimate, saturated_residual, strongest_order
 from .traces import Trace
 
 
@@ -126,15 +126,28 @@ class Problem:
             precision,
         )
 
+    @functools.cached_property
+    def ripples(self) -> list[list[Float[np.ndarray, "time n"]]]:
+        """For each joint the order that the saturated model leaves most of, as columns in each recording.
+
+        They join the saturated model: a ripple would otherwise pass for noise of its own frequency.
+        """
+        out = []
+        for j in range(self.dof):
+            left, _ = saturated_residual(self.traces, self.residual, j, [])
+            out.append(strongest_order([t.motion.q[:, j] for t in self.traces], left))
+        return out
+
     def noise(self, terms: Sequence[Term]) -> Noise:
         """Noise that a saturated model with these terms leaves."""
         extra = []
         for j in range(self.dof):
             here = [t for t in terms if any(np.any(c[:, j]) for c in t.columns)]
             extra.append(
-                [np.concatenate([t.columns[r][:, j] for t in here], 1) for r in range(len(self.traces))]
-                if here
-                else []
+                [
+                    np.concatenate([self.ripples[j][r], *(t.columns[r][:, j] for t in here)], 1)
+                    for r in range(len(self.traces))
+                ]
             )
         return estimate(self.traces, self.residual, extra)
 

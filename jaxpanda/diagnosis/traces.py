@@ -26,7 +26,9 @@ POSITION_CUTOFF = 12.0
 """Low-pass of q before it is differentiated, at most [Hz]."""
 _LEAST_CUTOFF = 5.0
 _TRIM = 0.4
-_GAP, _NEAR = 3.5, 0.04
+_REST = 5.0
+"""Noise of the velocity within which a joint counts as at rest, in standard deviations."""
+_GAP, _NEAR = 3.5, 0.12
 """Missing steps that make a gap, and how far beyond it samples do not count [s]."""
 _PARABOLA = 0.12
 """At the ends of a recording, over which q is taken for a parabola to continue it [s]."""
@@ -54,6 +56,8 @@ class Trace:
     """The coarse grid as indices into the fine one."""
     cutoff: float
     """Of the low-pass of torque and columns [Hz]."""
+    sign: Float[np.ndarray, "time dof"]
+    """Share of its frictionloss at which each joint's friction stands, on the fine grid."""
 
     @property
     def residual(self) -> Float[np.ndarray, "time dof"]:
@@ -86,7 +90,9 @@ def prepare(
     )
     if noise is None and rough.tau is not None:
         noise = signals_.white_noise(rough.tau)
-    q, qd, qdd = _derivatives(position, position_cutoff(position, noise, arm, rate), rate)
+    cutoff_q = position_cutoff(position, noise, arm, rate)
+    q, qd, qdd = _derivatives(position, cutoff_q, rate)
+    width = _REST * _velocity_noise(_position_noise(position), cutoff_q, rate)
 
     thinnest = max(1, int(rate / FINE_RATE + 1e-6))
     keep = np.arange(0, len(time), thinnest) if whole else rough.keep
@@ -96,7 +102,7 @@ def prepare(
     kept, dt = (keep - fine[0]) // thin, thin / rate
     cutoff = min(0.4 * rate / stride, 0.45 * rate)
 
-    sign = held_sign(arm, qd[fine], qdd[fine])
+    sign = held_sign(arm, qd[fine], qdd[fine], width)
     held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
     held, tau = held_fine[kept], None if rough.tau is None else rough.tau[keep]
     if stride > thin:
@@ -109,7 +115,7 @@ def prepare(
         load = scipy.interpolate.CubicSpline(motion.time, load)(np.clip(time[fine], *motion.time[[0, -1]]))
     channels = Channels(time[fine], q[fine], qd[fine], qdd[fine], load, load + held_fine)
     weight = _weight(recording.time, time[keep], rate)
-    return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff)
+    return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign)
 
 
 def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):
@@ -157,20 +163,24 @@ def _distance(
 
 
 def held_sign(
-    arm: Arm, qd: Float[np.ndarray, "time dof"], qdd: Float[np.ndarray, "time dof"]
+    arm: Arm,
+    qd: Float[np.ndarray, "time dof"],
+    qdd: Float[np.ndarray, "time dof"],
+    least: Float[np.ndarray, " dof"],
 ) -> Float[np.ndarray, "time dof"]:
     r"""Share of its frictionloss at which each joint's friction stands in MuJoCo, -1 to 1.
 
     A soft constraint holds the joint: $f = \mathrm{clip}(D\,(\ddot q + b\,\dot q), \pm F_c)$ with
-    $b = 2/(d_{max} T)$ and $D = \frac{d_0}{1 - d_0} / (M^{-1})_{jj}$ at the reference pose; on a light joint that
-    is far from a sign of the velocity.
+    $b = 2/(d_{max} T)$ and $D = \frac{d_0}{1 - d_0} / (M^{-1})_{jj}$ at the reference pose. On a light joint that
+    is far from a sign of the velocity; on a heavy one it would turn noise of a joint at rest into friction, so
+    the velocity over which it saturates is `least` [rad/s] at least.
     """
     level = np.asarray(arm.frictionloss)
-    rest = jnp.zeros(arm.dof)
-    M = np.asarray(mass_matrix(arm.chain, arm.standard, rest)) + np.diag(np.asarray(arm.armature))
+    M = np.asarray(mass_matrix(arm.chain, arm.standard, jnp.zeros(arm.dof))) + np.diag(np.asarray(arm.armature))
     stiffness = _IMPEDANCE_LEAST / (1 - _IMPEDANCE_LEAST) / np.maximum(np.diag(np.linalg.inv(M)), 1e-9)
-    force = stiffness * (qdd + 2 / (_IMPEDANCE_MOST * _SOLREF) * qd)
-    return np.clip(force / np.where(level > 0, level, 1.0), -1.0, 1.0)
+    b = 2 / (_IMPEDANCE_MOST * _SOLREF)
+    width = np.maximum(level / (stiffness * b), np.maximum(least, 1e-6))
+    return np.clip((qd + qdd / b) / width, -1.0, 1.0)
 
 
 def position_cutoff(
@@ -186,5 +196,15 @@ def position_cutoff(
     M = np.diag(np.asarray(mass_matrix(arm.chain, arm.standard, jnp.asarray(q.mean(0))))) + np.asarray(
         arm.armature
     )
-    crossing = np.sqrt(noise / np.maximum(np.abs(M) * signals_.white_noise(q), 1e-12)) / (2 * np.pi)
+    crossing = np.sqrt(noise / np.maximum(np.abs(M) * _position_noise(q), 1e-12)) / (2 * np.pi)
     return float(np.clip(1.3 * crossing.min(), min(_LEAST_CUTOFF, most), most))
+
+
+def _position_noise(q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof"]:
+    """Noise of q from sample to sample [rad], from the median of third differences: gaps do not count."""
+    return np.median(np.abs(np.diff(q, n=3, axis=0)), axis=0) / (0.6745 * np.sqrt(20))
+
+
+def _velocity_noise(noise: Float[np.ndarray, " dof"], cutoff: float, rate: float) -> Float[np.ndarray, " dof"]:
+    """Noise of the velocity [rad/s] from that of q [rad], white up to the cutoff."""
+    return 2 * np.pi * noise * np.sqrt(2 * cutoff**3 / (3 * rate))

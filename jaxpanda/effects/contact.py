@@ -1,5 +1,6 @@
 """Forces from outside."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -41,6 +42,9 @@ class ExternalContact(AbstractArmEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["ExternalContact"]:
         return []  # the event scan proposes them
+
+    def variants(self) -> Sequence["ExternalContact"]:
+        return [dataclasses.replace(self, form="link" if self.form == "base" else "base")]
 
     @property
     def joints(self) -> tuple[int, ...]:

@@ -1,5 +1,6 @@
 """What the drive train adds: rotor inertia, ripple, springs, compliance, backlash."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -119,6 +120,9 @@ class TorqueRipple(AbstractInstantEffect):
     def grid(cls, arm: Arm) -> Sequence["TorqueRipple"]:
         return []
 
+    def variants(self) -> Sequence["TorqueRipple"]:
+        return [dataclasses.replace(self, form="two"), dataclasses.replace(self, form="two", order=self.order / 2)]
+
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         one = (Coefficient("sine", "N·m"), Coefficient("cosine", "N·m"))
@@ -232,7 +236,7 @@ class Backlash(AbstractArmEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("lost_motion", "rad", sign=1),)
+        return (Coefficient("lost_motion", "rad", sign=1, scale=0.003),)
 
     @property
     def equation(self) -> str:

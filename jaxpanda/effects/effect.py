@@ -81,6 +81,10 @@ class AbstractEffect(eqx.Module):
     def equation(self) -> str:
         """Readable equation in the symbols of the parameters."""
 
+    def variants(self) -> Sequence["AbstractEffect"]:
+        """Other forms of the same shape that a refinement should try."""
+        return ()
+
     def parameters(
         self, c: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]
     ) -> list[dict[str, Any]]:

@@ -207,27 +207,30 @@ class StribeckFriction(AbstractInstantEffect):
 
 
 class LoadDependentFriction(AbstractInstantEffect):
-    r"""Friction that grows with the transmitted torque, $\tau_j = (F_c + \mu\,|\tau_{load}|) \tanh(\dot q_j / v_0)$.
+    r"""Friction that grows with the transmitted torque.
 
-    $\tau_{load}$ is the torque of the rigid arm at the joint. Form "extra" leaves out $F_c$.
+    $$\tau_j = (F_c + \mu\,|\tau_{load}|^p) \tanh(\dot q_j / v_0)$$
+
+    $\tau_{load}$ is the torque of the rigid arm at the joint, p is near 1. Form "extra" leaves out $F_c$.
 
     References:
         Bittencourt et al., IROS 2010; Duclusaud et al., arXiv 2410.08650.
     """
 
     name: ClassVar[str] = "load_dependent_friction"
-    shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
+    shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH, Shape("exponent", "1", 0.6, 1.6))
     reveals: ClassVar[str] = "the same speed in loaded and unloaded poses; with and without payload"
     confounded_with: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_gain", "friction_drift")
 
     joint: Joint
     v0: Float[Array, ""] | float
+    exponent: Float[Array, ""] | float
     form: str = eqx.field(static=True)
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["LoadDependentFriction"]:
         return [
-            cls(j, v0, form)
+            cls(j, v0, 1.0, form)
             for form in ("extra", "whole")
             for v0 in (0.004, 0.02, 0.06)
             for j in range(arm.dof)
@@ -241,11 +244,11 @@ class LoadDependentFriction(AbstractInstantEffect):
     @property
     def equation(self) -> str:
         level = "" if self.form == "extra" else "coulomb + "
-        return f"tau = ({level}load_coefficient * |tau_load|) * tanh(dq / v0)"
+        return f"tau = ({level}load_coefficient * |tau_load|^exponent) * tanh(dq / v0)"
 
     def at(self, s: Channels) -> Float[Array, " n"]:
         sign = smooth_sign(s.qd[self.joint], self.v0)
-        loaded = jnp.abs(s.load[self.joint]) * sign
+        loaded = (jnp.abs(s.load[self.joint]) + 1e-9) ** self.exponent * sign
         return jnp.stack([loaded] if self.form == "extra" else [loaded, sign])
 
 

@@ -13,7 +13,7 @@ from .motion import Motion
 
 _MOMENTS = ("first_moment_x", "first_moment_y", "first_moment_z")
 _INERTIAS = ("inertia_xx", "inertia_xy", "inertia_yy", "inertia_xz", "inertia_yz", "inertia_zz")
-_REACH = 0.12
+_REACH = 0.17
 """Where a payload's centre of mass is expected, along the last link's axis from its origin [m]."""
 
 
@@ -135,7 +135,7 @@ class Payload(AbstractArmEffect):
 
     @property
     def _basis(self):
-        return _body(_unit_payload(), 1.0, 0.06, 0.01, 1)
+        return _body(_unit_payload(), 1.0, 0.05, 0.005, 1)
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -184,7 +184,7 @@ class PayloadChange(AbstractArmEffect):
 
     @property
     def _basis(self):
-        return _body(_unit_payload(), 1.0, 0.06, 0.01, 1)
+        return _body(_unit_payload(), 1.0, 0.05, 0.005, 1)
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

@@ -19,14 +19,14 @@ _CHUNK = 1024
 class Channels(eqx.Module):
     """Joint-wise channels; at one instant `(dof,)`, over a recording `(time, dof)`."""
 
-    t: Float[Array, "*time"]
+    t: Float[Array, "*time"] | Float[np.ndarray, "*time"]
     """Clock of the recording [s]."""
-    q: Float[Array, "*time dof"]
-    qd: Float[Array, "*time dof"]
-    qdd: Float[Array, "*time dof"]
-    load: Float[Array, "*time dof"]
+    q: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"]
+    qd: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"]
+    qdd: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"]
+    load: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"]
     """Torque that the nominal rigid arm transmits [N m]."""
-    torque: Float[Array, "*time dof"]
+    torque: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"]
     """Torque of the whole nominal model, friction included [N m]."""
 
 

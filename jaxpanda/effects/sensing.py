@@ -152,18 +152,23 @@ class TorqueCrosstalk(AbstractInstantEffect):
 
 
 class EncoderOffset(AbstractArmEffect):
-    r"""Constant bias of a position sensor, $\tau(q + \Delta q_j) - \tau(q)$ to first order."""
+    r"""Constant bias of a position sensor, $\tau(q + \Delta q_j) - \tau(q)$.
+
+    Columns are $(\tau(q + a) - \tau(q))/a$ of the nominal torque, so that the coefficient is the offset near a.
+    """
 
     name: ClassVar[str] = "encoder_offset"
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "rad", -0.6, 0.6, False),)
     reveals: ClassVar[str] = "the joint at rest over its range; with and without payload"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction", "joint_spring")
     sensor: ClassVar[bool] = True
 
     joint: Joint
+    around: float
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["EncoderOffset"]:
-        return [cls(j) for j in range(arm.dof)]
+        return [cls(j, a) for a in (-0.2, -0.06, 0.01, 0.06, 0.2) for j in range(arm.dof)]
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -178,9 +183,13 @@ class EncoderOffset(AbstractArmEffect):
         return "q_true = q_measured + offset"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        a = np.copysign(max(abs(self.around), 1e-4), self.around)
         dq = np.zeros_like(motion.q)
-        dq[:, int(self.joint)] = 1.0
-        return motion.sensitivity(dq)[..., None]
+        dq[:, int(self.joint)] = a
+        return ((motion.moved(dq).load - motion.load) / a)[..., None]
+
+    def parameters(self, c, covariance):
+        return super().parameters(c, covariance)[:1]
 
 
 class TimeDelay(AbstractArmEffect):
@@ -219,9 +228,10 @@ class TimeDelay(AbstractArmEffect):
         return "tau_measured(t) = tau(t - delay)"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
-        torque, late = motion.torque, motion.time - self.around
+        d = np.copysign(max(abs(self.around), 1e-4), self.around)
+        torque, late = motion.torque, motion.time - d
         shifted = np.stack([np.interp(late, motion.time, torque[:, j]) for j in range(motion.dof)], 1)
-        return ((shifted - torque) / abs(self.around))[..., None] * np.sign(self.around)
+        return ((shifted - torque) / d)[..., None]
 
     def parameters(self, c, covariance):
         std = float(np.sqrt(max(covariance[0, 0], 0.0)))

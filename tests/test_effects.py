@@ -1,0 +1,186 @@
+"""The catalogue: every effect keeps the promises that the search, the corrected model and the export rely on."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxpanda import Arm
+from jaxpanda.corrected import effect_from_json
+from jaxpanda.effects import (
+    CATALOGUE,
+    AbstractInstantEffect,
+    AbstractJointEffect,
+    Channels,
+    Motion,
+    joint_columns,
+)
+from jaxpanda.effects.contact import ExternalContact
+from jaxpanda.effects.drive import JointElasticity, TorqueRipple
+from jaxpanda.effects.friction import CoulombFriction
+from jaxpanda.effects.load import GravityDirection, InertialParameters, Payload, PayloadChange
+from jaxpanda.effects.memory import PreslidingHysteresis
+from jaxpanda.effects.sensing import EncoderOffset, TimeDelay
+from jaxpanda.effects.unknown import Unknown
+from jaxpanda_kernels import rnea
+
+
+NAMES = {
+    "viscous_friction", "coulomb_friction", "asymmetric_friction", "stribeck_friction", "load_dependent_friction",
+    "friction_drift", "presliding_hysteresis", "torque_ripple", "backlash", "joint_elasticity", "armature",
+    "inertial_parameters", "payload", "payload_change", "gravity_direction", "joint_spring", "torque_offset",
+    "torque_gain", "torque_drift", "torque_crosstalk", "encoder_offset", "time_delay", "external_contact", "unknown",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def arm() -> Arm:
+    return Arm.panda()
+
+
+@pytest.fixture(scope="module")
+def motion(arm: Arm) -> Motion:
+    t = np.arange(400) / 100.0
+    phases, speeds = np.arange(7.0), 1.0 + 0.3 * np.arange(7)
+    middle = 0.5 * np.asarray(arm.lower + arm.upper)
+    angle = speeds * t[:, None] + phases
+    q, qd, qdd = middle + 0.5 * np.sin(angle), 0.5 * speeds * np.cos(angle), -0.5 * speeds**2 * np.sin(angle)
+    return Motion(arm, t, q, qd, qdd, np.zeros_like(q))
+
+
+@pytest.fixture(scope="module")
+def channels(motion: Motion) -> Channels:
+    return Channels(motion.time, motion.q, motion.qd, motion.qdd, motion.load, motion.torque)
+
+
+def shapes(arm: Arm):
+    """One shape of every form of every effect, those that only a scan proposes included."""
+    proposed = [
+        TorqueRipple(1, 20.0, "one"),
+        TorqueRipple(1, 20.0, "two"),
+        PayloadChange(6, 1.0, 1e9, "a.csv", "gained"),
+        ExternalContact(4, 1.0, 2.0, "a.csv", "base"),
+        ExternalContact(4, 1.0, 2.0, "a.csv", "link"),
+        *(Unknown(2, 3, (-1.9, -1.5, 0.4), form) for form in ("of q", "of q_k", "friction of q")),
+    ]
+    kinds = {}
+    for effect in [*proposed, *(e for c in CATALOGUE for e in c.grid(arm))]:
+        kinds.setdefault((type(effect).__name__, getattr(effect, "form", "")), effect)
+    return list(kinds.values())
+
+
+def columns(effect, motion: Motion, channels: Channels) -> np.ndarray:
+    if isinstance(effect, AbstractJointEffect):
+        wide = np.zeros((motion.samples, motion.dof, len(effect.coefficients)))
+        wide[:, effect.joints[0]] = joint_columns([effect], channels, motion.dt)[0]
+        return wide
+    return effect.over(motion)
+
+
+def test_the_catalogue_holds_the_interface_s_names_and_no_others():
+    assert {effect.name for effect in CATALOGUE} == NAMES
+
+
+def test_every_effect_has_as_many_columns_as_coefficients_and_all_are_finite(arm, motion, channels):
+    for effect in shapes(arm):
+        found = columns(effect, motion, channels)
+        assert found.shape == (motion.samples, motion.dof, len(effect.coefficients)), effect
+        assert np.isfinite(found).all(), effect
+        assert np.any(found, axis=(0, 1)).all(), effect
+
+
+def test_every_effect_reads_back_from_its_json_and_says_its_parameters(arm, motion, channels):
+    for effect in shapes(arm):
+        again = effect_from_json(effect.to_json())
+        np.testing.assert_array_equal(columns(again, motion, channels), columns(effect, motion, channels))
+        n = len(effect.coefficients)
+        parameters = effect.parameters(np.ones(n), np.eye(n))
+        assert {"name", "joint", "value", "std", "unit"} == set(parameters[0])
+        assert effect.equation
+
+
+def test_every_shape_of_a_grid_lies_within_its_bounds(arm):
+    for effect in (e for c in CATALOGUE for e in c.grid(arm)):
+        for shape in effect.shapes:
+            assert shape.lower <= getattr(effect, shape.name) <= shape.upper
+
+
+def test_derivatives_of_effects_without_memory_exist_at_rest(arm):
+    still = jnp.zeros(7)
+    for effect in shapes(arm):
+        if isinstance(effect, AbstractInstantEffect):
+            slope = jax.jacfwd(lambda qd, e=effect: e.at(Channels(jnp.ones(()), still, qd, still, still, still)))(still)
+            assert np.isfinite(slope).all(), effect
+
+
+def test_friction_takes_energy_out(arm, motion, channels):
+    for effect in (CoulombFriction(2, 0.01), PreslidingHysteresis(2, 0.01, "dahl only")):
+        torque = joint_columns([effect], channels, motion.dt)[0, :, 0]
+        assert torque @ motion.qd[:, 2] > 0
+
+
+def test_presliding_friction_goes_over_into_coulomb_friction_beyond_its_breakaway_distance(motion, channels):
+    dahl = joint_columns([PreslidingHysteresis(3, 1e-4, "dahl only")], channels, motion.dt)[0, :, 0]
+    sliding = np.abs(motion.qd[:, 3]) > 0.2
+    np.testing.assert_allclose(dahl[sliding], np.sign(motion.qd[sliding, 3]), atol=1e-3)
+
+
+def test_a_tilt_turns_the_gravity_that_inverse_dynamics_feels(arm, motion):
+    effect = GravityDirection.grid(arm)[0]
+    c = np.array([0.1, -0.2])
+    chain = dataclasses.replace(arm.chain, gravity=arm.chain.gravity + effect.gravity_change(c))
+    zero = jnp.zeros(7)
+    for i in (0, 150):
+        q = jnp.asarray(motion.q[i])
+        expected = rnea(chain, arm.standard, q, zero, zero) - rnea(arm.chain, arm.standard, q, zero, zero)
+        np.testing.assert_allclose(effect.over(motion)[i] @ c, expected, atol=1e-10)
+
+
+def test_a_body_s_columns_are_those_of_inverse_dynamics_with_its_parameters_added(arm, motion):
+    for effect in (Payload.grid(arm)[0], InertialParameters.grid(arm)[3]):
+        c = np.linspace(0.5, -0.1, 10)
+        link, change = effect.standard_change(c)
+        heavier = arm.standard.at[link].add(change)
+        q, qd, qdd = (jnp.asarray(a[77]) for a in (motion.q, motion.qd, motion.qdd))
+        expected = rnea(arm.chain, heavier, q, qd, qdd) - rnea(arm.chain, arm.standard, q, qd, qdd)
+        np.testing.assert_allclose(effect.over(motion)[77] @ c, expected, atol=1e-9)
+
+
+def test_a_contact_does_the_virtual_work_of_its_force(arm, motion):
+    """tau . dq = -F . dx of the link's origin; joints beyond the link feel nothing."""
+    from jaxpanda_kernels import link_poses
+
+    effect, F = ExternalContact(4, -1.0, 9.0, "a.csv", "base"), np.array([3.0, -1.0, 2.0])
+    tau = effect.over(motion)[123] @ np.concatenate([F, np.zeros(3)])
+    jac = jax.jacfwd(lambda q: link_poses(arm.chain, q)[1][4])(jnp.asarray(motion.q[123]))
+    np.testing.assert_allclose(tau, -F @ jac, atol=1e-10)
+    assert not np.any(tau[5:])
+
+
+def test_a_contact_acts_in_its_interval_only(motion):
+    felt = np.any(ExternalContact(6, 1.0, 2.0, "a.csv", "base").over(motion) != 0, axis=(1, 2))
+    assert motion.time[felt].min() >= 0.98
+    assert motion.time[felt].max() <= 2.02
+
+
+def test_an_encoder_offset_is_the_change_of_torque_to_first_order(arm, motion):
+    small = 1e-5
+    effect = EncoderOffset(3, small)
+    moved = motion.moved(np.broadcast_to(small * np.eye(7)[3], motion.q.shape))
+    np.testing.assert_allclose(effect.over(motion)[..., 0] * small, motion.sensitivity(moved.q - motion.q), atol=1e-7)
+
+
+def test_a_delay_reproduces_the_shifted_torque_where_it_was_linearised(motion):
+    d = 0.02
+    shifted = motion.torque + TimeDelay(7, d).over(motion)[..., 0] * d
+    np.testing.assert_allclose(shifted[2:], motion.torque[:-2], atol=1e-9)
+
+
+def test_a_stiff_joint_deflects_by_its_torque_over_its_stiffness(motion):
+    K = 2e5
+    found = JointElasticity(1, K, 0.2).over(motion)[50:-50, :, 0]
+    dq = np.zeros_like(motion.q)
+    dq[:, 1] = -motion.load[:, 1]
+    expected = motion.sensitivity(dq)[50:-50]
+    assert np.abs(found - expected).max() < 0.05 * np.abs(expected).max()
