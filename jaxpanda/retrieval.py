@@ -193,7 +193,8 @@ def retrieve(
             they can.
         penalty: "smooth" is `feasible.solve`; "exact" is the paper's Algorithm 1, for comparison.
         prefer: "best", the lowest objective; "nominal", near to the nominal parameters (of `arm`, else the
-            Panda's) in all that the coefficients do not tell, at an objective no more than `CONCESSION` higher.
+            Panda's) in all that the coefficients do not tell, at an objective no more than `CONCESSION` higher
+            ("smooth" penalty only).
         starts: random starts.
         seed: same seed, same answer.
         certificate: lower bound by convex optimisation; "auto" where the extra [sdp] is installed.
@@ -219,7 +220,7 @@ def retrieve(
     as_good[found.best] = True
     phi, violation = found.phi[found.best], float(found.violation[found.best])
     nominal = _nominal(arm, table)
-    if prefer == "nominal" and nominal is not None and feasible.any():
+    if prefer == "nominal" and penalty == "smooth" and nominal is not None and feasible.any():
         phi, violation = _towards(nominal, A, b, boxes, constraints, phi), 0.0
     wanted = certificate is True or (
         certificate == "auto" and importlib.util.find_spec("clarabel") is not None
