@@ -159,7 +159,7 @@ class Corrected(eqx.Module):
     def measured_torque(
         self, motion: Motion, channels: Channels, held_sign: Float[np.ndarray, "time dof"]
     ) -> Float[np.ndarray, "time dof"]:
-        """What the torque sensors would show over a motion [N m], both grids being the same."""
+        """What the torque sensors would show over a motion recorded later [N m], both grids being the same."""
         tau = (
             motion.torque
             + np.asarray(self.damping_change) * motion.qd
@@ -167,8 +167,9 @@ class Corrected(eqx.Module):
         )
         if np.any(np.asarray(self.change)):
             tau = tau + motion.regressor @ np.asarray(self.change).ravel()
-        for effect, c in zip(self.effects, self.coefficients, strict=True):
-            if effect.bound_to_recording:
+        for bound, c in zip(self.effects, self.coefficients, strict=True):
+            effect = bound.placed("", later=True)
+            if effect is None:
                 continue
             if isinstance(effect, AbstractJointEffect):
                 tau[:, effect.joints[0]] += joint_columns([effect], channels, motion.dt)[0] @ np.asarray(c)

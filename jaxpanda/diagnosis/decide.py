@@ -100,7 +100,7 @@ def coefficients(
     return state.design.x[place], state.design.covariance[place, place]
 
 
-def torque(problem: Problem, state: State, i: int) -> list[Float[np.ndarray, "time dof"]]:
+def torque(problem: Problem, state: State, i: int) -> list[Float[np.ndarray, "_time dof"]]:
     """Torque of a term in each recording [N m]."""
     c, _ = coefficients(problem, state, i)
     return [columns @ c for columns in state.terms[i].columns]

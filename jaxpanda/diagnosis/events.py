@@ -140,7 +140,7 @@ def _window_sums(sums, pairs):
 def _event(effect, b, G, clock, pairs) -> Proposal:
     coefficients = effect.coefficients
     deviation = np.tile([k.scale for k in coefficients], (len(b), 1))
-    signs = np.array([k.sign for k in coefficients])
+    signs = np.array([float(k.sign) for k in coefficients])
     n = b.shape[1]
     G = 0.5 * (G + np.swapaxes(G, 1, 2)) + 1e-9 * np.eye(n) / deviation[:1, :, None] ** 2
     score, scale = log_bayes(b, G, deviation, PHYSICAL_SCALES, signs)

@@ -35,7 +35,7 @@ class Noise:
     std: Float[np.ndarray, " dof"]
     """Of the noise itself [N m]."""
 
-    def whiten(self, x: Float[np.ndarray, "time ..."], joint: int) -> Float[np.ndarray, "time ..."]:
+    def whiten(self, x: Float[np.ndarray, "_time ..."], joint: int) -> Float[np.ndarray, "_time ..."]:
         """x with unit, uncorrelated noise; the first rows are zero."""
         a = self.a[joint]
         y = np.zeros_like(x)

@@ -67,7 +67,7 @@ def _rough(arm: Arm) -> Float[np.ndarray, "standard n"]:
 
 def nuisance(
     traces: Sequence[Trace], spread: Float[np.ndarray, "standard n"], knowledge: Knowledge
-) -> list[Float[np.ndarray, "time dof columns"]]:
+) -> list[Float[np.ndarray, "_time dof _n"]]:
     """The columns N of each recording."""
     arm = traces[0].motion.arm
     share = _FRICTION[knowledge]

@@ -31,7 +31,7 @@ class Candidates:
         return self.effects[0].name
 
 
-def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndarray, "time ..."]:
+def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndarray, "_time ..."]:
     """Columns of shapes of one class and form: `(time, m, n)` in one joint, `(time, dof, m, n)` in the arm."""
     if isinstance(effects[0], AbstractJointEffect):
         parts = []

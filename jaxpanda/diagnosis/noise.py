@@ -17,7 +17,7 @@ from .traces import Trace
 ORDER = 3
 
 
-def hats(x: Float[np.ndarray, " time"], count: int) -> Float[np.ndarray, "time count"]:
+def hats(x: Float[np.ndarray, " _time"], count: int) -> Float[np.ndarray, "_time _count"]:
     """Piecewise linear functions on knots at equally many samples each; they add up to 1."""
     knots = np.unique(np.quantile(x, np.linspace(0, 1, count)))
     if len(knots) < 3:
@@ -27,10 +27,10 @@ def hats(x: Float[np.ndarray, " time"], count: int) -> Float[np.ndarray, "time c
 
 def saturated_residual(
     traces: Sequence[Trace],
-    residual: Sequence[Float[np.ndarray, "time dof"]],
+    residual: Sequence[Float[np.ndarray, "_time dof"]],
     joint: int,
-    extra: Sequence[Float[np.ndarray, "time n"]],
-) -> tuple[list[Float[np.ndarray, " time"]], int]:
+    extra: Sequence[Float[np.ndarray, "_time _n"]],
+) -> tuple[list[Float[np.ndarray, " _time"]], int]:
     """What the saturated model leaves in a joint of each recording, and its degrees of freedom."""
 
     def stacked(part):
@@ -61,8 +61,8 @@ def saturated_residual(
 
 
 def strongest_order(
-    q: Sequence[Float[np.ndarray, " time"]], left: Sequence[Float[np.ndarray, " time"]]
-) -> list[Float[np.ndarray, "time 4"]]:
+    q: Sequence[Float[np.ndarray, " _time"]], left: Sequence[Float[np.ndarray, " _time"]]
+) -> list[Float[np.ndarray, "_time 4"]]:
     """The order of position that takes most out of a residual, with its second harmonic, as columns."""
     travel = max(float(np.ptp(x)) for x in q)
     orders = np.arange(4.0, 300.0, np.pi / (2 * max(travel, 0.3)))
@@ -76,8 +76,8 @@ def strongest_order(
 
 def estimate(
     traces: Sequence[Trace],
-    residual: Sequence[Float[np.ndarray, "time dof"]],
-    extra: Sequence[Sequence[Float[np.ndarray, "time n"]]],
+    residual: Sequence[Float[np.ndarray, "_time dof"]],
+    extra: Sequence[Sequence[Float[np.ndarray, "_time _n"]]],
 ) -> Noise:
     """Autoregressive noise of order 3; `extra` holds, for each joint, accepted columns in each recording."""
     dof = traces[0].motion.dof
@@ -88,7 +88,7 @@ def estimate(
     return Noise(a, sigma, std)
 
 
-def autoregression(parts: Sequence[Float[np.ndarray, " time"]], used: int) -> tuple[np.ndarray, float, float]:
+def autoregression(parts: Sequence[Float[np.ndarray, " _time"]], used: int) -> tuple[np.ndarray, float, float]:
     """Coefficients, deviation of the innovations, and deviation of the noise, by least squares."""
     past = np.concatenate(
         [np.stack([p[ORDER - 1 - k : len(p) - 1 - k] for k in range(ORDER)], 1) for p in parts]

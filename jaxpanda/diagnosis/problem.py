@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractArmEffect, AbstractEffect, AbstractJointEffect
+from ..effects import AbstractEffect, AbstractJointEffect
 from . import catchall
 from .evidence import Design, Noise, gram
 from .library import Candidates, build, columns_of
@@ -21,7 +21,7 @@ class Term:
     """An effect taken into the model: its columns in each recording, and the prior of its coefficients."""
 
     effect: AbstractEffect
-    columns: tuple[Float[np.ndarray, "time dof n"], ...]
+    columns: tuple[Float[np.ndarray, "_time dof _n"], ...]
     deviation: Float[np.ndarray, " n"]
 
     @property
@@ -37,14 +37,14 @@ class Problem:
     traces: tuple[Trace, ...]
     active: tuple[bool, ...]
     """Whether effects may act in a recording; not in those of reference."""
-    nuisance: tuple[Float[np.ndarray, "time dof n"], ...]
+    nuisance: tuple[Float[np.ndarray, "_time dof _n"], ...]
 
     @property
     def dof(self) -> int:
         return self.traces[0].motion.dof
 
     @functools.cached_property
-    def residual(self) -> list[Float[np.ndarray, "time dof"]]:
+    def residual(self) -> list[Float[np.ndarray, "_time dof"]]:
         """Measured less nominal torque [N m]."""
         return [trace.residual for trace in self.traces]
 
@@ -72,19 +72,27 @@ class Problem:
         """The effect's columns in all recordings."""
         return Term(effect, tuple(self.full_columns([effect])), deviation)
 
-    def full_columns(self, effects: Sequence[AbstractEffect]) -> list[Float[np.ndarray, "time dof n"]]:
+    def full_columns(self, effects: Sequence[AbstractEffect]) -> list[Float[np.ndarray, "_time dof _n"]]:
         """Columns of one effect, at all joints."""
         out = []
-        for trace, on in zip(self.traces, self.active, strict=True):
-            n = len(effects[0].coefficients)
-            wide = np.zeros((trace.motion.samples, self.dof, n))
-            if on and acts_in(effects[0], trace):
-                if isinstance(effects[0], AbstractJointEffect):
-                    wide[:, effects[0].joints[0]] = columns_of(effects, trace)[:, 0]
-                else:
-                    wide = columns_of(effects, trace)[:, :, 0]
+        for r, trace in enumerate(self.traces):
+            wide = np.zeros((trace.motion.samples, self.dof, len(effects[0].coefficients)))
+            here = self.placed(effects, r)
+            if here and isinstance(here[0], AbstractJointEffect):
+                wide[:, here[0].joints[0]] = columns_of(here, trace)[:, 0]
+            elif here:
+                wide = columns_of(here, trace)[:, :, 0]
             out.append(wide)
         return out
+
+    def placed(self, effects: Sequence[AbstractEffect], r: int) -> list[AbstractEffect]:
+        """What of shapes of one form acts in a recording; empty if nothing does."""
+        if not self.active[r]:
+            return []
+        names = [t.name for t in self.traces]
+        bound = getattr(effects[0], "recording", None)
+        later = None if bound is None else r > names.index(bound)
+        return [p for e in effects if (p := e.placed(names[r], later)) is not None]
 
     def whitened(self, columns: Sequence[np.ndarray], noise: Noise, joint: int) -> np.ndarray:
         """Rows of a joint in all recordings, one below the other, with unit noise."""
@@ -127,7 +135,7 @@ class Problem:
         )
 
     @functools.cached_property
-    def ripples(self) -> list[list[Float[np.ndarray, "time n"]]]:
+    def ripples(self) -> list[list[Float[np.ndarray, "_time _n"]]]:
         """For each joint the order that the saturated model leaves most of, as columns in each recording.
 
         They join the saturated model: a ripple would otherwise pass for noise of its own frequency.
@@ -150,11 +158,3 @@ class Problem:
                 ]
             )
         return estimate(self.traces, self.residual, extra)
-
-
-def acts_in(effect: AbstractEffect, trace: Trace) -> bool:
-    """Whether an effect is of this recording."""
-    return getattr(effect, "recording", trace.name) == trace.name
-
-
-__all__ = ["AbstractArmEffect", "Problem", "Term", "acts_in"]

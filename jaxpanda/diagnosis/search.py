@@ -13,7 +13,7 @@ from ..effects import AbstractEffect, AbstractJointEffect
 from .events import Proposal, ripple, windows
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, gram, log_bayes
 from .library import Candidates, columns_of
-from .problem import Problem, Term, acts_in
+from .problem import Problem, Term
 
 ACCEPT = 9.0
 """Evidence that an effect needs, its search over shapes paid for [nats]."""
@@ -24,8 +24,9 @@ SHADOW, EVENT_SHADOW = 0.012, 0.06
 never quite right, leaves over. Events in time, which fit any such leftover somewhere, need a larger share."""
 UNKNOWN_MARGIN, UNKNOWN_SHARE = 10.0, 0.06
 """What a free form must win by [nats, share]."""
-USUAL = {"viscous_friction": 1.5, "coulomb_friction": 1.5}
-"""Prior of effects that most simulations lack and most arms have, over the others' [nats]."""
+USUAL = {"viscous_friction": 1.5, "coulomb_friction": 1.5, "joint_elasticity": -15.0, "backlash": -6.0}
+"""Prior over that of the others [nats]. Most simulations lack friction; and what moves a link by its load is made of
+the same noise of q, differentiated twice, as the residual."""
 MOST_TERMS = 5
 _REFINED = 7
 _ROUNDS = 4
@@ -208,9 +209,9 @@ def score(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
     """Evidence of single shapes of one form at one place, and their prior deviations."""
     columns = []
-    for trace, on in zip(problem.traces, problem.active, strict=True):
-        here = on and acts_in(effects[0], trace)
-        columns.append(columns_of(effects, trace) * (1.0 if here else 0.0))
+    for r, trace in enumerate(problem.traces):
+        here = problem.placed(effects, r)
+        columns.append(columns_of(here, trace) if here else 0.0 * columns_of(effects, trace))
     value, scale, deviation = _score(problem, design, noise, effects, columns)
     return value, deviation * scale[:, None]
 
@@ -218,7 +219,7 @@ def score(
 def _score(problem: Problem, design: Design, noise: Noise, effects, columns, key=None):
     """Evidence, likeliest scale, and prior deviations before the scale; `key` names columns that come again."""
     coefficients = effects[0].coefficients
-    signs = np.array([k.sign for k in coefficients])
+    signs = np.array([float(k.sign) for k in coefficients])
 
     def prepared(j, make):
         if key is not None:
@@ -262,7 +263,7 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
                 break
         else:
             steps = steps * 0.35
-    for variant in effect.variants():
+    for variant in effect.variants(problem.traces[0].motion.arm):
         value, its_deviation = _single(problem, design, noise, variant)
         if value > best:
             effect, best, deviation = variant, value, its_deviation

@@ -56,7 +56,7 @@ class Trace:
     """The coarse grid as indices into the fine one."""
     cutoff: float
     """Of the low-pass of torque and columns [Hz]."""
-    sign: Float[np.ndarray, "time dof"]
+    sign: Float[np.ndarray, "fine dof"]
     """Share of its frictionloss at which each joint's friction stands, on the fine grid."""
 
     @property
@@ -65,7 +65,7 @@ class Trace:
         assert self.tau is not None
         return self.tau - self.motion.torque
 
-    def down(self, fine: Float[np.ndarray, "time ..."]) -> Float[np.ndarray, "kept ..."]:
+    def down(self, fine: Float[np.ndarray, "fine ..."]) -> Float[np.ndarray, "time ..."]:
         """From the fine grid to the coarse one, filtered like the torque."""
         if len(self.keep) == len(fine):
             return fine

@@ -17,8 +17,9 @@ from .motion import Motion
 class ExternalContact(AbstractArmEffect):
     r"""A force from outside on a link over an interval: $\tau = -J_i(q)^\top w$ for $t_0 \le t < t_1$.
 
-    $w$ is a constant wrench at the origin of the link's frame; form "base" keeps it along the base's axes, "link"
-    along the link's. Joints beyond the link do not feel it.
+    Form "base": w is a constant wrench at the origin of the link's frame, along the base's axes; form "link": along
+    the link's. Forms "point base" and "point link" are a force alone, at `point` of the link [m]: three numbers
+    where a wrench takes six. Joints beyond the link do not feel any.
 
     References:
         Haddadin, De Luca, Albu-Schäffer, T-RO 2017.
@@ -38,13 +39,26 @@ class ExternalContact(AbstractArmEffect):
     stop: Float[Array, ""] | float
     recording: str = eqx.field(static=True)
     form: str = eqx.field(static=True)
+    point: tuple[float, ...] = eqx.field(static=True, default=(0.0, 0.0, 0.0))
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["ExternalContact"]:
         return []  # the event scan proposes them
 
-    def variants(self) -> Sequence["ExternalContact"]:
-        return [dataclasses.replace(self, form="link" if self.form == "base" else "base")]
+    def variants(self, arm: Arm) -> Sequence["ExternalContact"]:
+        phi = np.asarray(arm.standard[self.link])
+        com = phi[1:4] / phi[0] if phi[0] > 1e-3 else np.zeros(3)
+        last = self.link == arm.dof - 1
+        ends = [np.array([0, 0, z]) for z in (0.1, 0.2)] if last else [np.asarray(arm.chain.p[self.link + 1])]
+        points = {tuple(float(v) for v in p) for p in (np.zeros(3), com, *ends)}
+        wrenches = [dataclasses.replace(self, form=form) for form in ("base", "link")]
+        forces = [
+            dataclasses.replace(self, form=form, point=p) for form in ("point base", "point link") for p in sorted(points)
+        ]
+        return [v for v in (*wrenches, *forces) if (v.form, v.point) != (self.form, self.point)]
+
+    def placed(self, recording: str, later: bool | None) -> "ExternalContact | None":
+        return self if recording == self.recording else None
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -53,18 +67,26 @@ class ExternalContact(AbstractArmEffect):
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         force = tuple(Coefficient(f"force_{axis}", "N", scale=10.0) for axis in "xyz")
+        if self.form.startswith("point"):
+            return force
         return force + tuple(Coefficient(f"moment_{axis}", "N·m", scale=1.5) for axis in "xyz")
 
     @property
     def equation(self) -> str:
-        return f"tau = -J_{self.link + 1}(q)^T * (force, moment) while start <= t < stop"
+        w = "force" if self.form.startswith("point") else "(force, moment)"
+        return f"tau = -J_{self.link + 1}(q)^T * {w} while start <= t < stop"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
-        J = motion.wrench_columns[:, self.link]
-        if self.form == "link":
-            R = motion.link_axes[:, self.link]
-            J = np.concatenate([J[..., :3] @ R, J[..., 3:] @ R], -1)
-        return J * window(motion.time, float(self.start), float(self.stop), motion.dt)[:, None, None]
+        J, R = motion.wrench_columns[:, self.link], motion.link_axes[:, self.link]
+        force, moment = J[..., :3], J[..., 3:]
+        if self.form.startswith("point"):  # the moment of a force f at the point is arm x f
+            lever = R @ np.array(self.point)
+            force = force + np.cross(moment, lever[:, None])
+            moment = moment[..., :0]
+        if self.form.endswith("link"):
+            force, moment = force @ R, moment @ R if moment.shape[-1] else moment
+        columns = np.concatenate([force, moment], -1)
+        return columns * window(motion.time, float(self.start), float(self.stop), motion.dt)[:, None, None]
 
     def parameters(self, c, covariance) -> list[dict[str, Any]]:
         joint = self.link + 1

@@ -120,7 +120,7 @@ class TorqueRipple(AbstractInstantEffect):
     def grid(cls, arm: Arm) -> Sequence["TorqueRipple"]:
         return []
 
-    def variants(self) -> Sequence["TorqueRipple"]:
+    def variants(self, arm: Arm) -> Sequence["TorqueRipple"]:
         return [dataclasses.replace(self, form="two"), dataclasses.replace(self, form="two", order=self.order / 2)]
 
     @property

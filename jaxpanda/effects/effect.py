@@ -59,7 +59,7 @@ class AbstractEffect(eqx.Module):
     sensor: ClassVar[bool] = False
     """Whether it changes what is measured, and not how the arm moves."""
     bound_to_recording: ClassVar[bool] = False
-    """Whether it happened in a recording, and says nothing about another one."""
+    """Whether it happened at some time in a recording; `placed` says what that means for others."""
 
     @classmethod
     @abc.abstractmethod
@@ -81,9 +81,18 @@ class AbstractEffect(eqx.Module):
     def equation(self) -> str:
         """Readable equation in the symbols of the parameters."""
 
-    def variants(self) -> Sequence["AbstractEffect"]:
+    def variants(self, arm: Arm) -> Sequence["AbstractEffect"]:
         """Other forms of the same shape that a refinement should try."""
         return ()
+
+    def placed(self, recording: str, later: bool | None) -> "AbstractEffect | None":
+        """What of the effect acts in a recording: itself, or None.
+
+        Args:
+            recording: its name.
+            later: than the recording that the effect is bound to; None where that is not known.
+        """
+        return self
 
     def parameters(
         self, c: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]

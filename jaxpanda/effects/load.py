@@ -1,5 +1,6 @@
 """What the arm carries and how it stands: inertias of links, payloads, gravity."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -178,6 +179,13 @@ class PayloadChange(AbstractArmEffect):
     def grid(cls, arm: Arm) -> Sequence["PayloadChange"]:
         return []  # the event scan proposes them
 
+    def placed(self, recording: str, later: bool | None) -> "PayloadChange | None":
+        """A body gained stays for what is recorded later, one lost was there before."""
+        if recording == self.recording:
+            return self
+        there = later is not None and later == (self.form == "gained")
+        return dataclasses.replace(self, start=-_EVER, stop=_EVER) if there else None
+
     @property
     def joints(self) -> tuple[int, ...]:
         return (self.link,)
@@ -203,6 +211,10 @@ class PayloadChange(AbstractArmEffect):
         joint = self.joints[0] + 1
         when = [{"name": "start", "joint": joint, "value": float(self.start), "std": None, "unit": "s"}]
         return _as_body(self, self._basis[0], c, covariance) + when
+
+
+_EVER = 1e9
+"""Seconds that no recording reaches."""
 
 
 class GravityDirection(AbstractArmEffect):

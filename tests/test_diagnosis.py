@@ -1,0 +1,215 @@
+"""Diagnosis: what is put in is named, located and fitted; what is not there is not reported.
+
+The recordings here come from the arm's own inverse dynamics with white noise, so they prove the machinery; how the
+tool does against an independent simulator is shown under `experiments/`.
+"""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxpanda import Arm, InputError, Recording
+from jaxpanda.corrected import Corrected
+from jaxpanda.diagnosis import diagnose, predict
+from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
+from jaxpanda.diagnosis.knowledge import check
+from jaxpanda.diagnosis.noise import autoregression
+from jaxpanda.effects import Motion
+from jaxpanda.effects.contact import ExternalContact
+from jaxpanda.effects.friction import StribeckFriction
+from jaxpanda.effects.memory import PreslidingHysteresis
+
+
+NOISE = 0.05
+
+
+def record(seed: int, extra=None, *, seconds: float = 8.0, rate: float = 200.0) -> Recording:
+    """A Fourier motion of the project's Panda with noise of 0.05 N m; `extra(t, q, qd, qdd)` is added to the torque."""
+    arm, rng = Arm.panda(), np.random.default_rng(seed)
+    t = np.arange(int(seconds * rate)) / rate
+    w = 2 * np.pi * np.array([0.1, 0.2, 0.3, 0.5])
+    a, b = rng.normal(0, 0.12, (2, 4, 7)) / np.array([1, 1.5, 2, 3])[:, None]
+    phase = w[:, None] * t
+    q = 0.5 * np.asarray(arm.lower + arm.upper) + np.sin(phase).T @ a + np.cos(phase).T @ b
+    qd = (w[:, None] * np.cos(phase)).T @ a - (w[:, None] * np.sin(phase)).T @ b
+    qdd = -((w**2)[:, None] * np.sin(phase)).T @ a - ((w**2)[:, None] * np.cos(phase)).T @ b
+    tau = Motion(arm, t, q, qd, qdd, np.zeros_like(q)).load + NOISE * rng.normal(size=q.shape)
+    if extra is not None:
+        tau = tau + extra(t, q, qd, qdd)
+    return Recording(f"motion_{seed}.csv", t, q + 1e-5 * rng.normal(size=q.shape), qd=qd, tau=tau)
+
+
+def at_joint(joint: int, law):
+    """An effect in one joint's torque."""
+    return lambda t, q, qd, qdd: np.eye(7)[joint - 1] * law(t, q, qd, qdd)[:, None]
+
+
+def stribeck(t, q, qd, qdd):
+    return np.sign(qd[:, 4]) * (0.2 + 0.25 * np.exp(-np.abs(qd[:, 4] / 0.1)))
+
+
+@pytest.fixture(scope="module")
+def found():
+    return diagnose(None, [record(0, at_joint(5, stribeck)), record(1, at_joint(5, stribeck))])
+
+
+def test_nothing_is_reported_when_nothing_is_missing():
+    result = diagnose(None, [record(2), record(3)])
+    assert result.verdict == "consistent"
+    assert result.to_json()["findings"] == []
+    np.testing.assert_allclose(result.fit.rmse_after, result.fit.rmse_before, rtol=0.02)
+
+
+def test_a_concealed_friction_law_is_named_and_located(found):
+    assert found.verdict == "explained"
+    assert [(f.effect, f.joints) for f in found.findings] == [("stribeck_friction", (4,))]
+    assert found.findings[0].confidence > 0.9
+
+
+def test_its_parameters_come_back(found):
+    parameters = {p["name"]: p["value"] for p in found.findings[0].parameters}
+    assert parameters["coulomb"] == pytest.approx(0.2, abs=0.03)
+    assert parameters["static_excess"] == pytest.approx(0.25, abs=0.05)
+    assert parameters["stribeck_velocity"] == pytest.approx(0.1, abs=0.03)
+
+
+def test_the_error_falls_to_the_noise_on_what_was_held_out(found):
+    fit = found.fit
+    assert fit.held_out_rmse_before[4] > 3 * fit.noise_floor[4]
+    assert fit.held_out_rmse_after[4] < 1.15 * fit.noise_floor[4]
+
+
+def test_prediction_from_the_saved_folder_reproduces_a_motion_never_seen(found, tmp_path):
+    found.save(tmp_path / "out")
+    document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert document["schema"] == "jaxpanda.diagnosis/1"
+    assert {"corrected.json", "corrected.xml", "diagnosis.json"} == {p.name for p in (tmp_path / "out").iterdir()}
+    other = record(7, at_joint(5, stribeck))
+    tau = predict(tmp_path / "out", dataclasses.replace(other, tau=None))
+    error = np.sqrt(np.mean((tau - other.tau) ** 2, 0))
+    assert tau.shape == other.tau.shape
+    np.testing.assert_allclose(error, NOISE, rtol=0.1)
+
+
+def test_two_effects_are_both_found_and_nothing_else():
+    def both(t, q, qd, qdd):
+        return at_joint(2, lambda t, q, qd, qdd: 0.5 * qd[:, 1])(t, q, qd, qdd) + np.eye(7)[5] * 0.2
+
+    result = diagnose(None, [record(0, both), record(1, both)])
+    assert {(f.effect, f.joints) for f in result.findings} == {("viscous_friction", (1,)), ("torque_offset", (5,))}
+
+
+def test_a_contact_is_found_in_its_interval_and_kept_out_of_predictions(tmp_path):
+    contact = ExternalContact(6, 3.0, 4.5, "motion_0.csv", "point base", (0.0, 0.0, 0.1))
+
+    def push(t, q, qd, qdd):
+        motion = Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q))
+        return contact.over(motion) @ np.array([4.0, -3.0, 2.0])
+
+    result = diagnose(None, [record(0, push), record(1)])
+    assert [f.effect for f in result.findings] == ["external_contact"]
+    assert result.findings[0].recordings == ("motion_0.csv",)
+    ((start, stop),) = result.findings[0].intervals
+    assert (start, stop) == (pytest.approx(3.0, abs=0.1), pytest.approx(4.5, abs=0.1))
+    result.save(tmp_path / "out")
+    error = predict(tmp_path / "out", record(7)) - record(7).tau
+    np.testing.assert_allclose(np.sqrt(np.mean(error**2, 0)), NOISE, rtol=0.1)
+
+
+def test_what_no_effect_explains_is_called_unknown():
+    def odd_one(t, q, qd, qdd):
+        return 0.3 * np.tanh(qd[:, 2] / 0.01) * np.sin(4 * q[:, 2])
+
+    result = diagnose(None, [record(0, at_joint(3, odd_one)), record(1, at_joint(3, odd_one))])
+    assert result.verdict in ("unexplained", "partly_explained")
+    assert ("unknown", (2,)) in {(f.effect, f.joints) for f in result.findings}
+    assert result.fit.held_out_rmse_after[2] < 0.5 * result.fit.held_out_rmse_before[2]
+
+
+def test_what_the_healthy_arm_shows_already_is_not_reported():
+    def worn(t, q, qd, qdd):
+        return np.eye(7)[3] * 0.3
+
+    result = diagnose(None, [record(0, worn)], reference=[record(1, worn), record(2, worn)], knowledge="unknown")
+    assert "torque_offset" not in {f.effect for f in result.findings}
+
+
+def test_bad_calls_say_what_would_work():
+    with pytest.raises(InputError, match="at least one"):
+        diagnose(None, [])
+    with pytest.raises(InputError, match="exact, identified"):
+        check("perfect")
+    with pytest.raises(InputError, match="tau_1"):
+        diagnose(None, [dataclasses.replace(record(0), tau=None)])
+
+
+def test_prediction_refuses_a_folder_without_a_diagnosis(tmp_path):
+    with pytest.raises(InputError, match=r"corrected\.json"):
+        predict(tmp_path, record(0))
+
+
+def test_the_bayes_factor_is_that_of_two_gaussians():
+    """Against the log density of the data under both models, by their full covariances."""
+    rng = np.random.default_rng(0)
+    A, Phi, r = rng.normal(size=(40, 3)), rng.normal(size=(40, 2)), rng.normal(size=40)
+    precision, deviation = np.array([1.0, 0.5, 2.0]), np.array([0.7, 1.3])
+    b, G = Design([A], [r], precision).in_joint(0, Phi[:, None], gram(Phi[:, None]))
+    found, _ = log_bayes(b, G, deviation[None], (1.0,))
+
+    def density(covariance):
+        return -0.5 * (r @ np.linalg.solve(covariance, r) + np.linalg.slogdet(covariance)[1])
+
+    without = np.eye(40) + A @ np.diag(1 / precision) @ A.T
+    expected = density(without + Phi @ np.diag(deviation**2) @ Phi.T) - density(without)
+    assert found[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_adding_a_term_gains_its_bayes_factor():
+    rng = np.random.default_rng(1)
+    A, Phi, r = rng.normal(size=(50, 4)), rng.normal(size=(50, 2)), rng.normal(size=50)
+    one = Design([A], [r], np.ones(4))
+    two = Design([np.hstack([A, Phi])], [r], np.concatenate([np.ones(4), [4.0, 0.25]]))
+    value, _ = log_bayes(*one.in_joint(0, Phi[:, None], gram(Phi[:, None])), np.array([[0.5, 2.0]]), (1.0,))
+    assert two.log_evidence - one.log_evidence == pytest.approx(value[0], rel=1e-9)
+
+
+def test_autoregression_recovers_the_noise_it_was_given():
+    rng = np.random.default_rng(2)
+    a, x = np.array([0.6, -0.3, 0.1]), np.zeros(20000)
+    for i in range(3, len(x)):
+        x[i] = a @ x[i - 3 : i][::-1] + 0.2 * rng.normal()
+    found, sigma, std = autoregression([x], 0)
+    np.testing.assert_allclose(found, a, atol=0.03)
+    assert sigma == pytest.approx(0.2, rel=0.03)
+    assert std == pytest.approx(x.std(), rel=0.03)
+
+
+def test_the_corrected_arm_s_dynamics_are_each_other_s_inverse_and_differentiable():
+    arm = Arm.panda()
+    zeros = jnp.zeros(7)
+    effects = (StribeckFriction(4, 0.1, 0.01, 2.0, "whole"), PreslidingHysteresis(2, 0.01, "dahl only"))
+    corrected = Corrected(
+        arm, jnp.zeros((7, 10)), zeros, zeros, effects, (jnp.array([0.2, 0.3]), jnp.array([0.4]))
+    )
+    q, qd = 0.5 * (arm.lower + arm.upper), 0.3 * jnp.ones(7)
+    tau = jnp.arange(7.0)
+    qdd = corrected.forward_dynamics(q, qd, tau)
+    np.testing.assert_allclose(corrected.inverse_dynamics(q, qd, qdd), tau, atol=1e-9)
+    nominal = arm.inverse_dynamics(q, qd, qdd)
+    assert corrected.inverse_dynamics(q, qd, qdd)[4] - nominal[4] == pytest.approx(0.2, abs=0.01)
+    slope = jax.jacfwd(lambda qd: corrected.forward_dynamics(q, qd, tau))(zeros)
+    assert np.isfinite(slope).all()
+
+
+def test_a_corrected_arm_reads_back_from_its_json():
+    arm = Arm.panda()
+    zeros = jnp.zeros(7)
+    one = Corrected(
+        arm, jnp.ones((7, 10)) * 1e-3, zeros, zeros, (PreslidingHysteresis(2, 0.01, "jenkins whole"),), (jnp.array([0.4, 0.1]),)
+    )
+    again = Corrected.from_json(json.loads(json.dumps(one.to_json())))
+    q, qd = 0.5 * (arm.lower + arm.upper), 0.3 * jnp.ones(7)
+    np.testing.assert_array_equal(again.inverse_dynamics(q, qd, qd), one.inverse_dynamics(q, qd, qd))
