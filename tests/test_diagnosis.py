@@ -86,7 +86,9 @@ def test_prediction_from_the_saved_folder_reproduces_a_motion_never_seen(found, 
     found.save(tmp_path / "out")
     document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert document["schema"] == "jaxpanda.diagnosis/1"
-    assert {"corrected.json", "corrected.xml", "diagnosis.json"} == {p.name for p in (tmp_path / "out").iterdir()}
+    assert {"corrected.json", "corrected.xml", "diagnosis.json"} == {
+        p.name for p in (tmp_path / "out").iterdir()
+    }
     other = record(7, at_joint(5, stribeck))
     tau = predict(tmp_path / "out", dataclasses.replace(other, tau=None))
     error = np.sqrt(np.mean((tau - other.tau) ** 2, 0))
@@ -99,7 +101,10 @@ def test_two_effects_are_both_found_and_nothing_else():
         return at_joint(2, lambda t, q, qd, qdd: 0.5 * qd[:, 1])(t, q, qd, qdd) + np.eye(7)[5] * 0.2
 
     result = diagnose(None, [record(0, both), record(1, both)])
-    assert {(f.effect, f.joints) for f in result.findings} == {("viscous_friction", (1,)), ("torque_offset", (5,))}
+    assert {(f.effect, f.joints) for f in result.findings} == {
+        ("viscous_friction", (1,)),
+        ("torque_offset", (5,)),
+    }
 
 
 def test_a_contact_is_found_in_its_interval_and_kept_out_of_predictions(tmp_path):
@@ -133,7 +138,9 @@ def test_what_the_healthy_arm_shows_already_is_not_reported():
     def worn(t, q, qd, qdd):
         return np.eye(7)[3] * 0.3
 
-    result = diagnose(None, [record(0, worn)], reference=[record(1, worn), record(2, worn)], knowledge="unknown")
+    result = diagnose(
+        None, [record(0, worn)], reference=[record(1, worn), record(2, worn)], knowledge="unknown"
+    )
     assert "torque_offset" not in {f.effect for f in result.findings}
 
 
@@ -208,7 +215,12 @@ def test_a_corrected_arm_reads_back_from_its_json():
     arm = Arm.panda()
     zeros = jnp.zeros(7)
     one = Corrected(
-        arm, jnp.ones((7, 10)) * 1e-3, zeros, zeros, (PreslidingHysteresis(2, 0.01, "jenkins whole"),), (jnp.array([0.4, 0.1]),)
+        arm,
+        jnp.ones((7, 10)) * 1e-3,
+        zeros,
+        zeros,
+        (PreslidingHysteresis(2, 0.01, "jenkins whole"),),
+        (jnp.array([0.4, 0.1]),),
     )
     again = Corrected.from_json(json.loads(json.dumps(one.to_json())))
     q, qd = 0.5 * (arm.lower + arm.upper), 0.3 * jnp.ones(7)

@@ -8,7 +8,6 @@ from ..effects.unknown import FORMS, Unknown
 from .library import Candidates, columns_of
 from .traces import Trace
 
-
 _KNOTS = {"odd in dq": 8, "even in dq": 8, "of q": 10, "friction of q": 9}
 _FEW = 6
 _KINDS = {

@@ -85,7 +85,7 @@ def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, fl
     if term.effect.name == "unknown":  # it has met its margin already
         by_name["unknown"] = max(by_name.get("unknown", -np.inf), evidence)
     names = list(by_name)
-    weights = np.array([by_name[n] for n in names] + [ACCEPT - 4.0]) / TEMPERATURE
+    weights = np.array([by_name[n] for n in names] + [0.5 * ACCEPT]) / TEMPERATURE
     posterior = np.exp(weights - scipy.special.logsumexp(weights))
     probability = dict(zip(names, posterior.tolist(), strict=False))
     return evidence, probability, probability.get(term.effect.name, 0.0)
@@ -146,7 +146,9 @@ def _finding(problem: Problem, state: State, places: Sequence[int], rivals: Sequ
         parameters=tuple(parameters),
         rms_torque=rms,
         evidence=float(sum(rivals[i][0] for i in places)),
-        summary=_summary(effect.name, joints, rms, intervals, names, alternatives, problem, own, '; '.join(equations)),
+        summary=_summary(
+            effect.name, joints, rms, intervals, names, alternatives, problem, own, "; ".join(equations)
+        ),
         terms=tuple(places),
     )
 

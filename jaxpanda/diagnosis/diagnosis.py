@@ -20,13 +20,12 @@ from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, load
 from . import knowledge as knowledge_
 from .decide import Finding, coefficients, findings
-from .problem import Problem
+from .problem import FOLDS, Problem
 from .search import State, search
 from .traces import Trace, prepare
 
 CORRECTED = "corrected.json"
 """What `predict` reads."""
-_FOLDS = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,7 +175,7 @@ def held_out(problem: Problem, state: State) -> list[tuple[np.ndarray, np.ndarra
     What happened once in a recording has no second instance to be tested on: those samples are left out.
     """
     bound = [t for t in state.terms if t.effect.bound_to_recording]
-    folds = signals_.blocks_many([t.signals for t in problem.traces], _FOLDS)
+    folds = signals_.blocks_many([t.signals for t in problem.traces], FOLDS)
     out = []
     for r, trace in enumerate(problem.traces):
         counts = trace.weight > 0

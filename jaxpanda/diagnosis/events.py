@@ -49,7 +49,9 @@ def ripple(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal]
             continue
         step = np.pi / (2 * travel)
         highest = min(400.0, 2 * np.pi * 0.9 * problem.traces[0].cutoff / speed)
-        orders = np.arange(max(2.5, 1.5 * step), highest, step)
+        orders = np.arange(
+            max(5.0, 3 * np.pi / travel), highest, step
+        )  # one turn and a half, lest it be a spring
         if not len(orders):
             continue
         Phi, G = problem.prepared(

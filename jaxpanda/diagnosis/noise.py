@@ -88,7 +88,9 @@ def estimate(
     return Noise(a, sigma, std)
 
 
-def autoregression(parts: Sequence[Float[np.ndarray, " _time"]], used: int) -> tuple[np.ndarray, float, float]:
+def autoregression(
+    parts: Sequence[Float[np.ndarray, " _time"]], used: int
+) -> tuple[np.ndarray, float, float]:
     """Coefficients, deviation of the innovations, and deviation of the noise, by least squares."""
     past = np.concatenate(
         [np.stack([p[ORDER - 1 - k : len(p) - 1 - k] for k in range(ORDER)], 1) for p in parts]

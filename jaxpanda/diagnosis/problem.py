@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from .. import signals as signals_
 from ..effects import AbstractEffect, AbstractJointEffect
 from . import catchall
 from .evidence import Design, Noise, gram
 from .library import Candidates, build, columns_of
 from .noise import estimate, saturated_residual, strongest_order
 from .traces import Trace
+
+FOLDS = 5
+"""Blocks of the cross-validation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +68,9 @@ class Problem:
         """Free forms on these recordings; zero in those of reference."""
         out = []
         for c in catchall.build(self.traces):
-            columns = tuple(x if on else np.zeros_like(x) for x, on in zip(c.columns, self.active, strict=True))
+            columns = tuple(
+                x if on else np.zeros_like(x) for x, on in zip(c.columns, self.active, strict=True)
+            )
             out.append(dataclasses.replace(c, columns=columns))
         return out
 
@@ -133,6 +139,24 @@ class Problem:
             [self.whitened([r[:, j] for r in self.residual], noise, j) for j in range(self.dof)],
             precision,
         )
+
+    @functools.cached_property
+    def folds(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Rows to train and to test on, blocked so that no test repeats training data."""
+        splits = signals_.blocks_many([t.signals for t in self.traces], FOLDS)
+        return [
+            (np.concatenate([s[0] for s in fold]), np.concatenate([s[1] for s in fold])) for fold in splits
+        ]
+
+    def held_out_error(self, design: Design) -> float:
+        """Squared whitened error on blocks that the coefficients were not fitted to."""
+        error = 0.0
+        for train, test in self.folds:
+            columns = [A[train] for A in design.columns]
+            x = Design(columns, [r[train] for r in design.residual], design.precision).x
+            for A, r in zip(design.columns, design.residual, strict=True):
+                error += float(np.sum((r[test] - A[test] @ x) ** 2))
+        return error
 
     @functools.cached_property
     def ripples(self) -> list[list[Float[np.ndarray, "_time _n"]]]:

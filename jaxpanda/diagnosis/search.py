@@ -15,16 +15,24 @@ from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, gram, log_bayes
 from .library import Candidates, columns_of
 from .problem import Problem, Term
 
-ACCEPT = 9.0
+ACCEPT = 25.0
 """Evidence that an effect needs, its search over shapes paid for [nats]."""
 SWAP = 3.0
 """Evidence that another effect must win by to take an accepted one's place [nats]."""
 SHADOW, EVENT_SHADOW = 0.012, 0.06
 """Share of the strongest term's evidence below which others are taken for its shadows: for what its shape, which is
 never quite right, leaves over. Events in time, which fit any such leftover somewhere, need a larger share."""
+HELD_OUT = 6.0
+"""By which a term must lower the squared held-out error, in units of the noise's variance."""
 UNKNOWN_MARGIN, UNKNOWN_SHARE = 10.0, 0.06
 """What a free form must win by [nats, share]."""
-USUAL = {"viscous_friction": 1.5, "coulomb_friction": 1.5, "joint_elasticity": -15.0, "backlash": -6.0}
+USUAL = {
+    "viscous_friction": 1.5,
+    "coulomb_friction": 1.5,
+    "joint_elasticity": -15.0,
+    "backlash": -6.0,
+    "time_delay": -20.0,
+}
 """Prior over that of the others [nats]. Most simulations lack friction; and what moves a link by its load is made of
 the same noise of q, differentiated twice, as the residual."""
 MOST_TERMS = 5
@@ -59,12 +67,32 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
     while len(state.terms) < MOST_TERMS:
         proposals = ranked(problem, state.design, state.noise)
         say(f"{len(state.terms)} terms: " + describe(proposals[:6]))
-        worthy = [p for p in proposals if p.evidence >= floor(p.effect, strongest)]
+        held = {t.key for t in state.terms}
+        new = [p for p in proposals if p.key not in held or p.effect.repeats]
+        worthy = [p for p in new if p.evidence >= floor(p.effect, strongest)]
         if not worthy:
             break
         state = with_terms(problem, (*state.terms, problem.term(worthy[0].effect, worthy[0].deviation)))
         strongest = max(strongest, worthy[0].evidence, gain(problem, state, -1))
-    return contest(problem, prune(problem, swap(problem, prune(problem, state, say), say), say), say)
+    state = prune(problem, swap(problem, prune(problem, state, say), say), say)
+    return gate(problem, contest(problem, state, say), say)
+
+
+def gate(problem: Problem, state: State, say: Any) -> State:
+    """Drop what does not help where it was not fitted; what happened once cannot be tested so, and stays."""
+    while True:
+        reference = problem.held_out_error(state.design)
+        for i in sorted(range(len(state.terms)), key=lambda i: gain(problem, state, i)):
+            if state.terms[i].effect.bound_to_recording:
+                continue
+            others = (*state.terms[:i], *state.terms[i + 1 :])
+            helped = problem.held_out_error(problem.design(others, state.noise)) - reference
+            if helped < HELD_OUT:
+                say(f"gate {state.terms[i].key}: held-out error falls by {helped:.1f} only")
+                state = with_terms(problem, others)
+                break
+        else:
+            return state
 
 
 def floor(effect: AbstractEffect, strongest: float) -> float:
@@ -83,7 +111,9 @@ def contest(problem: Problem, state: State, say: Any) -> State:
         gained = state.design.log_evidence - design.log_evidence
         at_joint = [c for c in problem.catchalls if c.joint == joint]
         best = max((*grids(problem, design, state.noise, at_joint),), key=lambda p: p.best)
-        say(f"joint {joint + 1}: {len(here)} terms {gained:.1f}, free form {best.best:.1f}: {best.effect.equation}")
+        say(
+            f"joint {joint + 1}: {len(here)} terms {gained:.1f}, free form {best.best:.1f}: {best.effect.equation}"
+        )
         if best.best > gained:
             state = with_terms(problem, (*others, problem.term(best.effect, best.deviation)))
     return state
@@ -176,7 +206,9 @@ def grids(problem: Problem, design: Design, noise: Noise, groups: Sequence[Candi
                 float(scipy.special.logsumexp(everything) - np.log(len(everything))),
                 float(score[top]),
                 deviation[top] * scale[top],
-                tuple(0.3 if s.logarithmic else 0.03 * (s.upper - s.lower) for s in group.effects[top].shapes),
+                tuple(
+                    0.3 if s.logarithmic else 0.03 * (s.upper - s.lower) for s in group.effects[top].shapes
+                ),
             )
         )
     return out

@@ -124,7 +124,10 @@ def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):
     more = max(4, round(0.4 * rate))
     x = np.arange(count) / rate
     ends = []
-    for part, at in ((q[:count], -np.arange(more, 0, -1) / rate), (q[-count:], x[-1] + np.arange(1, more + 1) / rate)):
+    for part, at in (
+        (q[:count], -np.arange(more, 0, -1) / rate),
+        (q[-count:], x[-1] + np.arange(1, more + 1) / rate),
+    ):
         fitted = np.polynomial.polynomial.polyfit(x, part, 2)
         ends.append(np.polynomial.polynomial.polyval(at, fitted).T)
     longer = signals_.derivatives(np.concatenate([ends[0], q, ends[1]]), cutoff, rate)
@@ -147,7 +150,10 @@ def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):
     more = max(4, round(0.4 * rate))
     x = np.arange(count) / rate
     ends = []
-    for part, at in ((q[:count], -np.arange(more, 0, -1) / rate), (q[-count:], x[-1] + np.arange(1, more + 1) / rate)):
+    for part, at in (
+        (q[:count], -np.arange(more, 0, -1) / rate),
+        (q[-count:], x[-1] + np.arange(1, more + 1) / rate),
+    ):
         fitted = np.polynomial.polynomial.polyfit(x, part, 2)
         ends.append(np.polynomial.polynomial.polyval(at, fitted).T)
     longer = signals_.derivatives(np.concatenate([ends[0], q, ends[1]]), cutoff, rate)
@@ -176,7 +182,9 @@ def held_sign(
     the velocity over which it saturates is `least` [rad/s] at least.
     """
     level = np.asarray(arm.frictionloss)
-    M = np.asarray(mass_matrix(arm.chain, arm.standard, jnp.zeros(arm.dof))) + np.diag(np.asarray(arm.armature))
+    M = np.asarray(mass_matrix(arm.chain, arm.standard, jnp.zeros(arm.dof))) + np.diag(
+        np.asarray(arm.armature)
+    )
     stiffness = _IMPEDANCE_LEAST / (1 - _IMPEDANCE_LEAST) / np.maximum(np.diag(np.linalg.inv(M)), 1e-9)
     b = 2 / (_IMPEDANCE_MOST * _SOLREF)
     width = np.maximum(level / (stiffness * b), np.maximum(least, 1e-6))
@@ -205,6 +213,8 @@ def _position_noise(q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof
     return np.median(np.abs(np.diff(q, n=3, axis=0)), axis=0) / (0.6745 * np.sqrt(20))
 
 
-def _velocity_noise(noise: Float[np.ndarray, " dof"], cutoff: float, rate: float) -> Float[np.ndarray, " dof"]:
+def _velocity_noise(
+    noise: Float[np.ndarray, " dof"], cutoff: float, rate: float
+) -> Float[np.ndarray, " dof"]:
     """Noise of the velocity [rad/s] from that of q [rad], white up to the cutoff."""
     return 2 * np.pi * noise * np.sqrt(2 * cutoff**3 / (3 * rate))

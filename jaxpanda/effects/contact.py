@@ -33,6 +33,7 @@ class ExternalContact(AbstractArmEffect):
     reveals: ClassVar[str] = "the same motion again: a contact does not come back with it"
     confounded_with: ClassVar[tuple[str, ...]] = ("payload_change", "torque_drift")
     bound_to_recording: ClassVar[bool] = True
+    repeats: ClassVar[bool] = True
 
     link: int = eqx.field(static=True)
     start: Float[Array, ""] | float
@@ -53,7 +54,9 @@ class ExternalContact(AbstractArmEffect):
         points = {tuple(float(v) for v in p) for p in (np.zeros(3), com, *ends)}
         wrenches = [dataclasses.replace(self, form=form) for form in ("base", "link")]
         forces = [
-            dataclasses.replace(self, form=form, point=p) for form in ("point base", "point link") for p in sorted(points)
+            dataclasses.replace(self, form=form, point=p)
+            for form in ("point base", "point link")
+            for p in sorted(points)
         ]
         return [v for v in (*wrenches, *forces) if (v.form, v.point) != (self.form, self.point)]
 

@@ -51,7 +51,7 @@ class JointSpring(AbstractInstantEffect):
 
     $$\tau_j = k\,q_j + b, \qquad \text{at rest at } q_0 = -b/k$$
 
-    Form "cubic" adds $k_3 q^3$, "stop" is a spring that acts on one side only, from `q0` on.
+    Form "cubic" adds $k_2 q^2 + k_3 q^3$: a spring that stiffens away from where it rests. Form "centred" is without b.
     """
 
     name: ClassVar[str] = "joint_spring"
@@ -68,9 +68,11 @@ class JointSpring(AbstractInstantEffect):
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         k, b = Coefficient("stiffness", "N·m/rad", sign=1), Coefficient("torque_at_zero", "N·m")
-        return {"linear": (k, b), "centred": (k,), "cubic": (k, b, Coefficient("cubic", "N·m/rad³"))}[
-            self.form
-        ]
+        return {
+            "linear": (k, b),
+            "centred": (k,),
+            "cubic": (k, b, Coefficient("quadratic", "N·m/rad²"), Coefficient("cubic", "N·m/rad³")),
+        }[self.form]
 
     @property
     def equation(self) -> str:
@@ -79,14 +81,14 @@ class JointSpring(AbstractInstantEffect):
             + {
                 "linear": "stiffness * q + torque_at_zero",
                 "centred": "stiffness * q",
-                "cubic": "stiffness * q + torque_at_zero + cubic * q^3",
+                "cubic": "stiffness * q + torque_at_zero + quadratic * q^2 + cubic * q^3",
             }[self.form]
         )
 
     def at(self, s: Channels) -> Float[Array, " n"]:
         q = s.q[self.joint]
         one = jnp.ones_like(q)
-        return jnp.stack({"linear": [q, one], "centred": [q], "cubic": [q, one, q**3]}[self.form])
+        return jnp.stack({"linear": [q, one], "centred": [q], "cubic": [q, one, q**2, q**3]}[self.form])
 
     def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
         if self.form == "cubic" or arm.stiffness[int(self.joint)] != 0:
@@ -108,6 +110,7 @@ class TorqueRipple(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "torque_ripple"
+    repeats: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("order", "1/rad", 2.5, 600.0),)
     reveals: ClassVar[str] = "a sweep of speeds: the frequency moves with it, the order stays"
     confounded_with: ClassVar[tuple[str, ...]] = ("joint_spring", "inertial_parameters")
@@ -121,7 +124,7 @@ class TorqueRipple(AbstractInstantEffect):
         return []
 
     def variants(self, arm: Arm) -> Sequence["TorqueRipple"]:
-        return [dataclasses.replace(self, form="two"), dataclasses.replace(self, form="two", order=self.order / 2)]
+        return [dataclasses.replace(self, form="two")] if self.form == "one" else []
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -160,8 +163,15 @@ class JointElasticity(AbstractArmEffect):
 
     name: ClassVar[str] = "joint_elasticity"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("stiffness", "N·m/rad", 50.0, 1e6),)
-    reveals: ClassVar[str] = "heavy and light load in the same pose; bursts of high frequency; both encoders, if any"
-    confounded_with: ClassVar[tuple[str, ...]] = ("encoder_offset", "time_delay", "backlash", "inertial_parameters")
+    reveals: ClassVar[str] = (
+        "heavy and light load in the same pose; bursts of high frequency; both encoders, if any"
+    )
+    confounded_with: ClassVar[tuple[str, ...]] = (
+        "encoder_offset",
+        "time_delay",
+        "backlash",
+        "inertial_parameters",
+    )
 
     joint: Joint
     stiffness: Float[Array, ""] | float
@@ -191,7 +201,9 @@ class JointElasticity(AbstractArmEffect):
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         j, K, zeta = int(self.joint), float(self.stiffness), float(self.damping_ratio)
         inertia = max(motion.mean_inertia[j], 1e-6)
-        load = np.concatenate([motion.load[:, j], motion.load[::-1, j]])  # mirrored: no step from end to start
+        load = np.concatenate(
+            [motion.load[:, j], motion.load[::-1, j]]
+        )  # mirrored: no step from end to start
         w = 2 * np.pi * np.fft.rfftfreq(len(load), motion.dt)
         spring = 1 - w**2 * inertia / K + 2j * zeta * w * np.sqrt(inertia / K)
         smooth = 1 / (1 + (w / (2 * np.pi * _DEFLECTION_CUTOFF)) ** 4)
@@ -207,15 +219,22 @@ _DEFLECTION_CUTOFF = 6.0
 class Backlash(AbstractArmEffect):
     r"""A dead band between motor and link: the link lies on one flank or the other.
 
-    $$q_{link} = q_j - b\,p, \qquad p = \mathrm{clip}(p + \dot q_j\,dt / b, -1, 1)$$
+    $$q_{link} = q_j - b\,p, \qquad p = \tanh(\tau_j/\tau_0)
+      \quad\text{or}\quad p \leftarrow \mathrm{clip}(p + \dot q_j\,dt / b, -1, 1)$$
 
-    The torque changes by what the shift of the link costs, to first order in b.
+    Form "load-driven": the load pushes the link to a flank; "friction-driven": the link is dragged along. Columns
+    are $(\tau(q - b p) - \tau(q))/b$, so that the coefficient is b near `half_width`. Where the load never changes
+    sign this is an encoder offset.
     """
 
     name: ClassVar[str] = "backlash"
-    shapes: ClassVar[tuple[Shape, ...]] = (Shape("half_width", "rad", 1e-4, 0.05),)
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("half_width", "rad", 1e-4, 0.1),)
     reveals: ClassVar[str] = "slow motion through poses where the load changes sign"
-    confounded_with: ClassVar[tuple[str, ...]] = ("presliding_hysteresis", "joint_elasticity")
+    confounded_with: ClassVar[tuple[str, ...]] = (
+        "encoder_offset",
+        "presliding_hysteresis",
+        "joint_elasticity",
+    )
 
     joint: Joint
     half_width: Float[Array, ""] | float
@@ -226,7 +245,7 @@ class Backlash(AbstractArmEffect):
         return [
             cls(j, b, form)
             for form in ("friction-driven", "load-driven")
-            for b in (5e-4, 2e-3, 8e-3)
+            for b in (5e-4, 4e-3, 0.03)
             for j in range(arm.dof)
         ]
 
@@ -236,11 +255,12 @@ class Backlash(AbstractArmEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("lost_motion", "rad", sign=1, scale=0.003),)
+        return (Coefficient("lost_motion", "rad", sign=1, scale=0.02),)
 
     @property
     def equation(self) -> str:
-        return "q_link = q - lost_motion * p, dp = dq * dt / half_width, |p| <= 1"
+        where = "tanh(tau / 0.2)" if self.form == "load-driven" else "clip(p + dq * dt / half_width, -1, 1)"
+        return f"q_link = q - lost_motion * p, p = {where}"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         j, b = int(self.joint), float(self.half_width)
@@ -251,10 +271,14 @@ class Backlash(AbstractArmEffect):
                 state = min(1.0, max(-1.0, state + moved))
                 p[i] = state
         else:
-            p = np.tanh(motion.load[:, j] / (b * 100.0))
+            p = np.tanh(motion.load[:, j] / _FLANK)
         dq = np.zeros_like(motion.q)
-        dq[:, j] = -p
-        return motion.sensitivity(dq)[..., None]
+        dq[:, j] = -b * p
+        return ((motion.moved(dq).load - motion.load) / b)[..., None]
+
+
+_FLANK = 0.2
+"""Load that brings a link to its flank [N m]."""
 
 
 EFFECTS = (Armature, JointSpring, TorqueRipple, JointElasticity, Backlash)

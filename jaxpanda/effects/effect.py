@@ -56,6 +56,8 @@ class AbstractEffect(eqx.Module):
     reveals: ClassVar[str] = ""
     """The motion that shows the effect, and tells it from what it is confounded with."""
     confounded_with: ClassVar[tuple[str, ...]] = ()
+    repeats: ClassVar[bool] = False
+    """Whether it can act several times over at one place."""
     sensor: ClassVar[bool] = False
     """Whether it changes what is measured, and not how the arm moves."""
     bound_to_recording: ClassVar[bool] = False

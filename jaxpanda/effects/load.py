@@ -168,6 +168,7 @@ class PayloadChange(AbstractArmEffect):
     reveals: ClassVar[str] = "the same poses before and after"
     confounded_with: ClassVar[tuple[str, ...]] = ("external_contact", "torque_drift")
     bound_to_recording: ClassVar[bool] = True
+    repeats: ClassVar[bool] = True
 
     link: int = eqx.field(static=True)
     start: Float[Array, ""] | float
@@ -230,6 +231,7 @@ class GravityDirection(AbstractArmEffect):
     confounded_with: ClassVar[tuple[str, ...]] = ("joint_spring", "torque_offset", "inertial_parameters")
 
     across: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    dof: int = eqx.field(static=True)
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["GravityDirection"]:
@@ -238,11 +240,11 @@ class GravityDirection(AbstractArmEffect):
         axes = [e - along * along[k] for k, e in enumerate(np.eye(3))]
         kept = sorted(range(3), key=lambda k: abs(along[k]))[:2]
         rows = [axes[k] / np.linalg.norm(axes[k]) for k in sorted(kept)]
-        return [cls(tuple(tuple(float(v) for v in row) for row in rows))]
+        return [cls(tuple(tuple(float(v) for v in row) for row in rows), arm.dof)]
 
     @property
     def joints(self) -> tuple[int, ...]:
-        return ()
+        return tuple(range(self.dof))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -254,6 +256,9 @@ class GravityDirection(AbstractArmEffect):
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         return motion.gravity_columns @ np.array(self.across).T
+
+    def parameters(self, c, covariance):
+        return [{**p, "joint": None} for p in super().parameters(c, covariance)]
 
     def gravity_change(self, c: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
         """What is added to the gravity vector [m/s²]."""

@@ -107,12 +107,15 @@ class TorqueDrift(AbstractInstantEffect):
     @property
     def equation(self) -> str:
         wave = "offset + trend * t + sine * sin(w t) + cosine * cos(w t)"
-        return "tau = " + {
-            "extra": "change * (1 - exp(-t / time_constant))",
-            "offset": "offset + change * (1 - exp(-t / time_constant))",
-            "wave": f"{wave}, w = 2 pi / time_constant",
-            "wandering": f"{wave} + sine_2 * sin(2 w t) + cosine_2 * cos(2 w t), w = 2 pi / time_constant",
-        }[self.form]
+        return (
+            "tau = "
+            + {
+                "extra": "change * (1 - exp(-t / time_constant))",
+                "offset": "offset + change * (1 - exp(-t / time_constant))",
+                "wave": f"{wave}, w = 2 pi / time_constant",
+                "wandering": f"{wave} + sine_2 * sin(2 w t) + cosine_2 * cos(2 w t), w = 2 pi / time_constant",
+            }[self.form]
+        )
 
     def at(self, s: Channels) -> Float[Array, " n"]:
         one, phase = jnp.ones_like(s.t), s.t / self.time_constant

@@ -13,7 +13,6 @@ from ..arm import Arm
 from .effect import AbstractInstantEffect, Coefficient, smooth_sign
 from .motion import Channels, Joint
 
-
 _WIDTH = 0.01
 FORMS = {
     "odd in dq": "an odd function of the joint's velocity",
@@ -37,6 +36,7 @@ class Unknown(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "unknown"
+    repeats: ClassVar[bool] = True
     reveals: ClassVar[str] = "single-joint motions that vary the channel it depends on and nothing else"
 
     joint: Joint
@@ -91,7 +91,13 @@ class Unknown(AbstractInstantEffect):
 
     def parameters(self, c, covariance):
         knots = [
-            {"name": f"knot_{k + 1}", "joint": int(self.joint) + 1, "value": float(x), "std": None, "unit": "-"}
+            {
+                "name": f"knot_{k + 1}",
+                "joint": int(self.joint) + 1,
+                "value": float(x),
+                "std": None,
+                "unit": "-",
+            }
             for k, x in enumerate(np.asarray(self.knots))
         ]
         return super().parameters(c, covariance) + knots
