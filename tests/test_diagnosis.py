@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from jaxpanda import Arm, InputError, Recording
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, predict
@@ -21,7 +22,6 @@ from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.friction import StribeckFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
-
 
 NOISE = 0.05
 

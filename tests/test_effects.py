@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxpanda_kernels import rnea
+
 from jaxpanda import Arm
 from jaxpanda.corrected import effect_from_json
 from jaxpanda.effects import (
@@ -23,8 +25,6 @@ from jaxpanda.effects.load import GravityDirection, InertialParameters, Payload,
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TimeDelay
 from jaxpanda.effects.unknown import Unknown
-from jaxpanda_kernels import rnea
-
 
 NAMES = {
     "viscous_friction", "coulomb_friction", "asymmetric_friction", "stribeck_friction", "load_dependent_friction",

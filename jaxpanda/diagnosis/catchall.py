@@ -1,4 +1,4 @@
-"""Free-form hypotheses for each joint: what competes with the catalogue, so that it need not be believed blindly."""
+"""Free-form hypotheses for each joint: they compete with the catalogue, so that it is not believed blindly."""
 
 from collections.abc import Sequence
 

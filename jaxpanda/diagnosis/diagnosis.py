@@ -1,13 +1,13 @@
-"""`diagnose`: from a simulation and recordings to the physics that it is missing; and `predict` from what it found."""
+"""`diagnose`: from a simulation and recordings to the physics that it is missing; `predict`: from what it found."""
 
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.interpolate
 from jaxtyping import Float
 
 from .. import files, markup
@@ -75,7 +75,7 @@ class Diagnosis:
             "consistent": "The simulation agrees with the recordings: what differs is within noise.",
             "explained": "The simulation is missing physics that explains the difference.",
             "partly_explained": "The simulation is missing physics, and part of the difference stays unexplained.",
-            "unexplained": "The simulation differs from the recordings in a way that no named effect explains.",
+            "unexplained": "The simulation differs from the recordings in a way that no effect explains.",
         }[self.verdict]
         return [sentence, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]
 
@@ -103,7 +103,7 @@ def diagnose(
         model: the simulation (MJCF) as the user has it; None for the project's own Panda.
         recordings: of the arm, with torque.
         reference: recordings of the same arm from when nothing was wrong; what they show is not reported.
-        knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` says what the words mean.
+        knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` explains the words.
 
     Raises:
         InputError: a file that cannot be read, or a recording that does not fit the model.
@@ -235,11 +235,11 @@ def _corrected_xml(source: MjcfSource, corrected: Corrected) -> tuple[str, tuple
     native = corrected.as_written.native
     moved = any(hasattr(e, "standard_change") for e in corrected.effects)
     warnings: list[str] = []
-    arm = Arm(
-        corrected.arm.chain, corrected.arm.standard, *(jnp.maximum(getattr(native, n), 0.0) for n in
-        ("armature", "damping", "frictionloss", "stiffness")), native.springref, native.lower, native.upper,
-        native.joint_names, native.link_names, native.name,
-    )  # fmt: skip
+    names = ("armature", "damping", "frictionloss", "stiffness", "springref")
+    values = tuple(
+        getattr(native, n) if n == "springref" else jnp.maximum(getattr(native, n), 0.0) for n in names
+    )
+    arm = eqx.tree_at(lambda a: tuple(getattr(a, n) for n in names), corrected.arm, values)
     try:
         result = write_parameters(source, arm, np.asarray(native.standard) if moved else None)
     except InputError as error:
@@ -272,6 +272,5 @@ def predict(folder: str | Path, motion: str | Path | Recording) -> Float[np.ndar
     recording.require_dof(corrected.arm.dof)
     trace = prepare(recording, corrected.arm, whole=True, noise=np.asarray(document["torque_noise"]))
     tau = corrected.measured_torque(trace.motion, trace.channels, trace.sign)
-    return scipy.interpolate.interp1d(
-        trace.motion.time, tau, axis=0, fill_value="extrapolate", assume_sorted=True
-    )(recording.time)
+    grid = trace.motion.time
+    return np.stack([np.interp(recording.time, grid, column) for column in tau.T], 1)

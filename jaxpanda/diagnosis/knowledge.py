@@ -90,11 +90,12 @@ def changes(
 ) -> tuple[Float[np.ndarray, "dof 10"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
     """What coefficients x of `nuisance` mean: changes of standard parameters, damping and frictionloss."""
     inertial = spread.shape[1]
-    out = [(spread @ x[:inertial]).reshape(arm.dof, 10)]
+    standard = (spread @ x[:inertial]).reshape(arm.dof, 10)
+    friction = []
     done = inertial
     for value in (np.asarray(arm.damping), np.asarray(arm.frictionloss)):
         change, here = np.zeros(arm.dof), np.flatnonzero(_FRICTION[knowledge] * value > 0)
         change[here] = _FRICTION[knowledge] * value[here] * x[done : done + len(here)]
         done += len(here)
-        out.append(change)
-    return out[0], out[1], out[2]
+        friction.append(change)
+    return standard, friction[0], friction[1]

@@ -33,10 +33,11 @@ class Candidates:
 
 def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndarray, "_time ..."]:
     """Columns of shapes of one class and form: `(time, m, n)` in one joint, `(time, dof, m, n)` in the arm."""
-    if isinstance(effects[0], AbstractJointEffect):
+    local = [e for e in effects if isinstance(e, AbstractJointEffect)]
+    if local:
         parts = []
-        for start in range(0, len(effects), _BATCH):
-            batch = list(effects[start : start + _BATCH])
+        for start in range(0, len(local), _BATCH):
+            batch = list(local[start : start + _BATCH])
             filled = batch + [batch[-1]] * (_BATCH - len(batch))
             parts.append(joint_columns(filled, trace.channels, trace.dt)[: len(batch)])
         return trace.down(np.moveaxis(np.concatenate(parts), 0, 1))

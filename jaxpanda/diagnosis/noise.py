@@ -33,12 +33,11 @@ def saturated_residual(
 ) -> tuple[list[Float[np.ndarray, " _time"]], int]:
     """What the saturated model leaves in a joint of each recording, and its degrees of freedom."""
 
-    def stacked(part):
-        return np.concatenate([part(trace) for trace in traces])
+    def stacked(part) -> np.ndarray:
+        return np.concatenate([np.asarray(part(trace)) for trace in traces])
 
-    Y = stacked(lambda t: t.motion.regressor[:, joint])
-    Q, R, _ = scipy.linalg.qr(Y, mode="economic", pivoting=True)
-    rank = int(np.sum(np.abs(np.diag(R)) > 1e-6 * max(abs(R[0, 0]), 1e-12)))
+    Q, s, _ = np.linalg.svd(stacked(lambda t: t.motion.regressor[:, joint]), full_matrices=False)
+    rigid = Q[:, s > 1e-7 * s[0]]
     q, qd = stacked(lambda t: t.motion.q[:, joint]), stacked(lambda t: t.motion.qd[:, joint])
     load = stacked(lambda t: t.motion.load[:, joint])
     sign = stacked(lambda t: t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / 0.01)))
@@ -47,16 +46,14 @@ def saturated_residual(
     swings = np.stack([np.concatenate(rates), np.concatenate(bends)], 1)
     speed = hats(np.abs(qd), 8)
     clock = scipy.linalg.block_diag(*[hats(t.motion.time, 10) for t in traces])
-    A = np.concatenate(
-        [Q[:, :rank], hats(q, 10), speed, sign[:, None] * speed, sign[:, None] * hats(q, 4), hats(load, 5),
-         sign[:, None] * hats(load, 3), swings, clock, sign[:, None] * clock[:, ::2], *([np.concatenate(list(extra))] if extra else [])],
-        1,
-    )  # fmt: skip
+    smooth = [rigid, hats(q, 10), speed, hats(load, 5), swings, clock]
+    rough = [sign[:, None] * x for x in (speed, hats(q, 4), hats(load, 3), clock[:, ::2])]
+    A = np.concatenate([*smooth, *rough, *([np.concatenate(list(extra))] if extra else [])], 1)
     w = np.concatenate([t.weight for t in traces])
     U, s, _ = np.linalg.svd(A * w[:, None], full_matrices=False)
     U = U[:, s > 1e-6 * s[0]]
-    r = stacked_residual = np.concatenate([x[:, joint] for x in residual]) * w
-    left = stacked_residual - U @ (U.T @ r)
+    r = np.concatenate([x[:, joint] for x in residual]) * w
+    left = r - U @ (U.T @ r)
     return np.split(left, np.cumsum([t.motion.samples for t in traces])[:-1]), U.shape[1]
 
 

@@ -20,22 +20,27 @@ ACCEPT = 25.0
 SWAP = 3.0
 """Evidence that another effect must win by to take an accepted one's place [nats]."""
 SHADOW, EVENT_SHADOW = 0.012, 0.06
-"""Share of the strongest term's evidence below which others are taken for its shadows: for what its shape, which is
-never quite right, leaves over. Events in time, which fit any such leftover somewhere, need a larger share."""
+"""Share of the strongest term's evidence below which others are taken for its shadows: for what its shape, never
+quite right, leaves over. Events in time, which fit any such leftover somewhere, need a larger share."""
 HELD_OUT = 6.0
 """By which a term must lower the squared held-out error, in units of the noise's variance."""
 UNKNOWN_MARGIN, UNKNOWN_SHARE = 10.0, 0.06
 """What a free form must win by [nats, share]."""
 USUAL = {
-    "viscous_friction": 1.5,
-    "coulomb_friction": 1.5,
-    "joint_elasticity": -15.0,
+    "asymmetric_friction": -3.0,
+    "stribeck_friction": -3.0,
+    "load_dependent_friction": -3.0,
+    "friction_drift": -3.0,
+    "joint_spring": -3.0,
+    "torque_drift": -3.0,
     "backlash": -6.0,
+    "joint_elasticity": -15.0,
     "time_delay": -20.0,
 }
-"""Prior over that of the others [nats]. Most simulations lack friction; and what moves a link by its load is made of
-the same noise of q, differentiated twice, as the residual."""
-MOST_TERMS = 5
+"""Prior over that of the others [nats]. Laws that hold a simpler one as a special case must earn what they add; what
+moves a link by its load or in time is made of the same noise of q, differentiated twice, as the residual."""
+MOST_SWAPPED = 6
+MOST_TERMS = 12
 _REFINED = 7
 _ROUNDS = 4
 
@@ -61,7 +66,7 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
 
 
 def search(problem: Problem, log: list[str] | None = None) -> State:
-    """Add the likeliest effect while one has evidence; then see if another does better in an earlier one's place."""
+    """Add the likeliest effect while one has evidence; then see if another does better in its place."""
     say = log.append if log is not None else (lambda _: None)
     state, strongest = start(problem), 0.0
     while len(state.terms) < MOST_TERMS:
@@ -121,7 +126,7 @@ def contest(problem: Problem, state: State, say: Any) -> State:
 
 def swap(problem: Problem, state: State, say: Any) -> State:
     """Take out each term in turn, and put in what then has most evidence."""
-    for i in range(len(state.terms) if len(state.terms) > 1 else 0):
+    for i in range(len(state.terms) if 1 < len(state.terms) <= MOST_SWAPPED else 0):
         others = (*state.terms[:i], *state.terms[i + 1 :])
         design = problem.design(others, state.noise)
         proposals = ranked(problem, design, state.noise)
@@ -262,7 +267,7 @@ def _score(problem: Problem, design: Design, noise: Noise, effects, columns, key
     if isinstance(effects[0], AbstractJointEffect):
         j = effects[0].joints[0]
         b, G = design.in_joint(j, *prepared(j, lambda: columns))
-        deviation = _deviation(coefficients, np.concatenate(columns), noise.std[j])
+        deviation = _deviation(coefficients, np.concatenate(columns), float(noise.std[j]))
     else:
         parts = [prepared(j, lambda j=j: [c[:, j] for c in columns]) for j in range(problem.dof)]
         b, G = design.in_arm([p[0] for p in parts], [p[1] for p in parts])

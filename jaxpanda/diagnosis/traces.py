@@ -118,22 +118,6 @@ def prepare(
     return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign)
 
 
-def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):
-    """`signals.derivatives`, with q continued beyond its ends as parabolas: an arm may be cut off in motion."""
-    count = min(max(8, round(_PARABOLA * rate)), len(q))
-    more = max(4, round(0.4 * rate))
-    x = np.arange(count) / rate
-    ends = []
-    for part, at in (
-        (q[:count], -np.arange(more, 0, -1) / rate),
-        (q[-count:], x[-1] + np.arange(1, more + 1) / rate),
-    ):
-        fitted = np.polynomial.polynomial.polyfit(x, part, 2)
-        ends.append(np.polynomial.polynomial.polyval(at, fitted).T)
-    longer = signals_.derivatives(np.concatenate([ends[0], q, ends[1]]), cutoff, rate)
-    return tuple(part[more:-more] for part in longer)
-
-
 def _weight(
     rows: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " time"], rate: float
 ) -> Float[np.ndarray, " time"]:

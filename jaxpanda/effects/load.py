@@ -21,7 +21,7 @@ _REACH = 0.17
 def _body(
     base: Float[np.ndarray, "10"], mass: float, moment: float, inertia: float, sign: int
 ) -> tuple[Float[np.ndarray, "10 10"], tuple[Coefficient, ...]]:
-    """Standard parameters of each coefficient, and the coefficients: a body like `base`, and departures from it."""
+    """Standard parameters of each coefficient, and the coefficients: a body like `base`, and departures."""
     directions = np.eye(10)
     directions[:, 0] = base
     coefficients = (

@@ -1,4 +1,4 @@
-"""What no named effect explains: a free function of one channel, so that it is still located, described and fitted."""
+"""What no named effect explains: a free function of one channel, so that it is still located and fitted."""
 
 from collections.abc import Sequence
 from typing import ClassVar
