@@ -1,7 +1,7 @@
 """Diagnosis: what is put in is named, located and fitted; what is not there is not reported.
 
-The recordings here come from the arm's own inverse dynamics with white noise, so they prove the machinery; how the
-tool does against an independent simulator is shown under `experiments/`.
+The recordings here come from the arm's own inverse dynamics with white noise, so they prove the machinery; how
+the tool does against an independent simulator is shown under `experiments/`.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ NOISE = 0.05
 
 
 def record(seed: int, extra=None, *, seconds: float = 8.0, rate: float = 200.0) -> Recording:
-    """A Fourier motion of the project's Panda with noise of 0.05 N m; `extra(t, q, qd, qdd)` is added to the torque."""
+    """A Fourier motion of the project's Panda with noise of 0.05 N m; `extra` is added to the torque."""
     arm, rng = Arm.panda(), np.random.default_rng(seed)
     t = np.arange(int(seconds * rate)) / rate
     w = 2 * np.pi * np.array([0.1, 0.2, 0.3, 0.5])

@@ -30,8 +30,8 @@ _REST = 5.0
 """Noise of the velocity within which a joint counts as at rest, in standard deviations."""
 _GAP, _NEAR = 3.5, 0.12
 """Missing steps that make a gap, and how far beyond it samples do not count [s]."""
-_PARABOLA = 0.12
-"""At the ends of a recording, over which q is taken for a parabola to continue it [s]."""
+_CONTINUED = 0.3
+"""At the ends of a recording, over which q is fitted to continue it [s]."""
 _SOLREF, _IMPEDANCE_LEAST, _IMPEDANCE_MOST = 0.02, 0.9, 0.95
 """MuJoCo's defaults for the constraint that frictionloss is: time constant [s], impedance at rest and beyond."""
 
@@ -129,16 +129,16 @@ def _weight(
 
 
 def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):
-    """`signals.derivatives`, with q continued beyond its ends as parabolas: an arm may be cut off in motion."""
-    count = min(max(8, round(_PARABOLA * rate)), len(q))
-    more = max(4, round(0.4 * rate))
+    """`signals.derivatives`, with q continued beyond its ends by quartics: an arm may be cut off in motion."""
+    count = min(max(8, round(_CONTINUED * rate)), len(q))
+    more = max(4, round(0.2 * rate))
     x = np.arange(count) / rate
     ends = []
     for part, at in (
         (q[:count], -np.arange(more, 0, -1) / rate),
         (q[-count:], x[-1] + np.arange(1, more + 1) / rate),
     ):
-        fitted = np.polynomial.polynomial.polyfit(x, part, 2)
+        fitted = np.polynomial.polynomial.polyfit(x, part, 4)
         ends.append(np.polynomial.polynomial.polyval(at, fitted).T)
     longer = signals_.derivatives(np.concatenate([ends[0], q, ends[1]]), cutoff, rate)
     return tuple(part[more:-more] for part in longer)

@@ -51,7 +51,8 @@ class JointSpring(AbstractInstantEffect):
 
     $$\tau_j = k\,q_j + b, \qquad \text{at rest at } q_0 = -b/k$$
 
-    Form "cubic" adds $k_2 q^2 + k_3 q^3$: a spring that stiffens away from where it rests. Form "centred" is without b.
+    Form "cubic" adds $k_2 q^2 + k_3 q^3$: a spring that stiffens away from where it rests. Form "centred" is
+    without b.
     """
 
     name: ClassVar[str] = "joint_spring"

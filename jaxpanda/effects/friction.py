@@ -258,8 +258,8 @@ class FrictionDrift(AbstractInstantEffect):
     $$\tau_j = g(t)\,(a \tanh(\dot q_j / v_0) + b\,\dot q_j) + F_c \tanh(\dot q_j / v_0) + F_v \dot q_j, \qquad
       g(t) = 1 - e^{-t/T}$$
 
-    A long time constant is a linear trend. Form "level" has `a` and `F_c` only, "slope" `b` and `F_v`; "... extra"
-    leaves out the constant part.
+    A long time constant is a linear trend. Form "level" has `a` and `F_c` only, "slope" `b` and `F_v`;
+    "... extra" leaves out the constant part.
 
     References:
         Simoni et al., Robotica 2017; Wolf and Iskandar, ICRA 2018.

@@ -17,8 +17,8 @@ class PreslidingHysteresis(AbstractMemoryEffect):
 
     Dahl's form, $\tau_j = F_c z$ with $dz = (\mathrm{sign}(\dot q) - z)\,|\dot q|\,dt / x_s$, and the Jenkins
     element of Maxwell-slip models, $dz = \dot q\,dt / x_s$ with $|z| \le 1$. Form "... extra" has
-    $z - \tanh(\dot q / v_0)$, for a joint whose model holds Coulomb friction at its full level already; "... whole"
-    has both levels free.
+    $z - \tanh(\dot q / v_0)$, for a joint whose model holds Coulomb friction at its full level already;
+    "... whole" has both levels free.
 
     References:
         Dahl 1968; Al-Bender, Lampaert, Swevers, IEEE TAC 2005.
