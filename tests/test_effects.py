@@ -28,9 +28,11 @@ from jaxpanda.effects.unknown import Unknown
 
 NAMES = {
     "viscous_friction", "coulomb_friction", "asymmetric_friction", "stribeck_friction",
-    "load_dependent_friction", "friction_drift", "presliding_hysteresis", "torque_ripple", "backlash", "joint_elasticity", "armature",
+    "load_dependent_friction", "friction_drift", "presliding_hysteresis", "torque_ripple", "backlash",
+    "joint_elasticity", "armature",
     "inertial_parameters", "payload", "payload_change", "gravity_direction", "joint_spring", "torque_offset",
-    "torque_gain", "torque_drift", "torque_crosstalk", "encoder_offset", "time_delay", "external_contact", "unknown",
+    "torque_gain", "torque_drift", "torque_crosstalk", "encoder_offset", "time_delay", "external_contact",
+    "unknown",
 }  # fmt: skip
 
 

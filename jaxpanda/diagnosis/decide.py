@@ -172,7 +172,7 @@ def _summary(name, joints, rms, intervals, recordings, alternatives, problem, ow
     strongest = int(np.argmax(rms))
     if name == "unknown":
         return (
-            f"Joint {strongest + 1} shows {rms[strongest]:.3g} N·m rms that no effect in the catalogue explains; it is"
+            f"Joint {strongest + 1} shows {rms[strongest]:.3g} N·m rms that no named effect explains; it is"
             f" fitted as a free curve ({equation.split(': ')[-1]})."
         )
     where = "" if len(joints) in (0, problem.dof) else f" at joint{'s' * (len(joints) > 1)} {_listed(joints)}"

@@ -1,4 +1,4 @@
-"""`diagnose`: from a simulation and recordings to the physics that it is missing; `predict`: from what it found."""
+"""`diagnose`: which physics a simulation is missing, by recordings; `predict`: torque, by what it found."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -74,7 +74,7 @@ class Diagnosis:
         sentence = {
             "consistent": "The simulation agrees with the recordings: what differs is within noise.",
             "explained": "The simulation is missing physics that explains the difference.",
-            "partly_explained": "The simulation is missing physics, and part of the difference stays unexplained.",
+            "partly_explained": "The simulation is missing physics, and part of it stays unexplained.",
             "unexplained": "The simulation differs from the recordings in a way that no effect explains.",
         }[self.verdict]
         return [sentence, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]

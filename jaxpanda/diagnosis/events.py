@@ -110,7 +110,12 @@ def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal
 
         count = len(edges)
         pairs = np.array(
-            [(s, min(s + w, count)) for w in _WIDTHS for s in range(_EDGE, count - _EDGE, max(1, w // 6)) if s + w <= count]
+            [
+                (s, s + w)
+                for w in _WIDTHS
+                for s in range(_EDGE, count - max(_EDGE, w - 1), max(1, w // 6))
+                if s + w <= count
+            ]
         )  # fmt: skip
         stops = np.append(clock, trace.motion.time[-1] + trace.motion.dt)
         for link in range(problem.dof) if len(pairs) else ():

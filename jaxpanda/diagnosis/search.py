@@ -37,8 +37,8 @@ USUAL = {
     "joint_elasticity": -15.0,
     "time_delay": -20.0,
 }
-"""Prior over that of the others [nats]. Laws that hold a simpler one as a special case must earn what they add; what
-moves a link by its load or in time is made of the same noise of q, differentiated twice, as the residual."""
+"""Prior over that of the others [nats]. Laws that hold a simpler one as a special case must earn what they add;
+what moves a link by its load or in time is made of the same noise of q, differentiated twice, as the residual."""
 MOST_SWAPPED = 6
 MOST_TERMS = 12
 _REFINED = 7
@@ -116,9 +116,7 @@ def contest(problem: Problem, state: State, say: Any) -> State:
         gained = state.design.log_evidence - design.log_evidence
         at_joint = [c for c in problem.catchalls if c.joint == joint]
         best = max((*grids(problem, design, state.noise, at_joint),), key=lambda p: p.best)
-        say(
-            f"joint {joint + 1}: {len(here)} terms {gained:.1f}, free form {best.best:.1f}: {best.effect.equation}"
-        )
+        say(f"joint {joint + 1}: {len(here)} terms {gained:.1f}, {best.best:.1f}: {best.effect.equation}")
         if best.best > gained:
             state = with_terms(problem, (*others, problem.term(best.effect, best.deviation)))
     return state

@@ -18,8 +18,8 @@ class ExternalContact(AbstractArmEffect):
     r"""A force from outside on a link over an interval: $\tau = -J_i(q)^\top w$ for $t_0 \le t < t_1$.
 
     Form "base": w is a constant wrench at the origin of the link's frame, along the base's axes; form "link":
-    along the link's. Forms "point base" and "point link" are a force alone, at `point` of the link [m]: three numbers
-    where a wrench takes six. Joints beyond the link do not feel any.
+    along the link's. Forms "point base" and "point link" are a force alone, at `point` of the link [m]: three
+    numbers where a wrench takes six. Joints beyond the link do not feel any.
 
     References:
         Haddadin, De Luca, Albu-Schäffer, T-RO 2017.

@@ -152,11 +152,12 @@ class JointElasticity(AbstractArmEffect):
     r"""Compliance between the position sensor and the link.
 
     $$\tau(q + \delta) = -K\,\delta, \qquad
-      \delta(\omega) \approx \frac{-\tau(q)(\omega)}{K - \bar M_{jj}\omega^2 + 2 i \zeta \omega \sqrt{K \bar M_{jj}}}$$
+      \delta(\omega) \approx
+      \frac{-\tau(q)(\omega)}{K - \bar M_{jj}\omega^2 + 2 i \zeta \omega \sqrt{K \bar M_{jj}}}$$
 
     The link swings on its spring, which near its resonance is far from $-\tau/K$; the columns are
-    $K\,(\tau(q + \delta) - \tau(q))$, so that the coefficient is the compliance where `stiffness` is right. $\delta$
-    is low-passed: its second derivative would otherwise be made of the same noise as the residual.
+    $K\,(\tau(q + \delta) - \tau(q))$, so that the coefficient is the compliance where `stiffness` is right.
+    $\delta$ is low-passed: its second derivative would otherwise be made of the same noise as the residual.
 
     References:
         Spong, ASME JDSMC 1987; Madsen et al., Math. Probl. Eng. 2020.
@@ -224,8 +225,8 @@ class Backlash(AbstractArmEffect):
       \quad\text{or}\quad p \leftarrow \mathrm{clip}(p + \dot q_j\,dt / b, -1, 1)$$
 
     Form "load-driven": the load pushes the link to a flank; "friction-driven": the link is dragged along. Columns
-    are $(\tau(q - b p) - \tau(q))/b$, so that the coefficient is b near `half_width`. Where the load never changes
-    sign this is an encoder offset.
+    are $(\tau(q - b p) - \tau(q))/b$, so that the coefficient is b near `half_width`. Where the load never
+    changes sign this is an encoder offset.
     """
 
     name: ClassVar[str] = "backlash"

@@ -129,7 +129,8 @@ class AsymmetricFriction(AbstractInstantEffect):
                 "extra": "coulomb_asymmetry * tanh(dq / v0)^2",
                 "viscous": "damping * dq + damping_asymmetry * |dq|",
                 "viscous extra": "damping_asymmetry * |dq|",
-                "both": "coulomb * tanh(dq / v0) + coulomb_asymmetry * tanh(dq / v0)^2 + damping_asymmetry * |dq|",
+                "both": "coulomb * tanh(dq / v0) + coulomb_asymmetry * tanh(dq / v0)^2"
+                " + damping_asymmetry * |dq|",
             }[self.form]
         )
 
