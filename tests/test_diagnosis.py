@@ -90,6 +90,7 @@ def test_prediction_from_the_saved_folder_reproduces_a_motion_never_seen(found, 
         p.name for p in (tmp_path / "out").iterdir()
     }
     other = record(7, at_joint(5, stribeck))
+    assert other.tau is not None
     tau = predict(tmp_path / "out", dataclasses.replace(other, tau=None))
     error = np.sqrt(np.mean((tau - other.tau) ** 2, 0))
     assert tau.shape == other.tau.shape
@@ -117,7 +118,9 @@ def test_a_contact_is_found_in_its_interval_and_kept_out_of_predictions(tmp_path
     result = diagnose(None, [record(0, push), record(1)])
     assert [f.effect for f in result.findings] == ["external_contact"]
     assert result.findings[0].recordings == ("motion_0.csv",)
-    ((start, stop),) = result.findings[0].intervals
+    intervals = result.findings[0].intervals
+    assert intervals is not None
+    ((start, stop),) = intervals
     assert (start, stop) == (pytest.approx(3.0, abs=0.1), pytest.approx(4.5, abs=0.1))
     result.save(tmp_path / "out")
     error = predict(tmp_path / "out", record(7)) - record(7).tau
