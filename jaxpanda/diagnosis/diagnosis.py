@@ -69,6 +69,12 @@ class Diagnosis:
             "log": list(self.log),
         }
 
+    def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+        """For each recording its name, times [s], and what is left of the torque before and after [N m]."""
+        before, after = _errors(self.problem, self.state)
+        traces = self.problem.traces
+        return [(t.name, t.motion.time, b, a) for t, b, a in zip(traces, before, after, strict=True)]
+
     def lines(self) -> list[str]:
         """Verdict and findings in plain sentences."""
         sentence = {
@@ -154,16 +160,19 @@ def pose(
     return Problem(traces, active, tuple(knowledge_.nuisance(traces, spread, knowledge))), spread
 
 
+def _errors(problem: Problem, state: State) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Errors of torque before and after in each recording [N m]; zero where a recording has gaps."""
+    before = [r * t.weight[:, None] for r, t in zip(problem.residual, problem.traces, strict=True)]
+    explained = []
+    for i, (n, t) in enumerate(zip(problem.nuisance, problem.traces, strict=True)):
+        columns = np.concatenate([n, *(term.columns[i] for term in state.terms)], 2)
+        explained.append((columns @ state.design.x) * t.weight[:, None])
+    return before, [b - e for b, e in zip(before, explained, strict=True)]
+
+
 def fit(problem: Problem, state: State) -> Fit:
     """Errors before and after; held out: coefficients refitted without the block that is tested."""
-    before = [r * t.weight[:, None] for r, t in zip(problem.residual, problem.traces, strict=True)]
-    everything = [
-        np.concatenate([n, *(t.columns[i] for t in state.terms)], 2) for i, n in enumerate(problem.nuisance)
-    ]
-    after = [
-        (r - c @ state.design.x) * t.weight[:, None]
-        for r, c, t in zip(problem.residual, everything, problem.traces, strict=True)
-    ]
+    before, after = _errors(problem, state)
     held = held_out(problem, state)
     return Fit(_rms(before), _rms(after), _rms([b[m] for b, (_, m) in zip(before, held, strict=True)]),
                _rms([e[m] for e, m in held]), state.noise.std)  # fmt: skip
