@@ -15,7 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .arm import Arm as Arm
+    from .corrected import Corrected as Corrected
     from .demo import demonstrate as demonstrate
+    from .diagnosis import Diagnosis as Diagnosis
+    from .diagnosis import diagnose as diagnose
+    from .diagnosis import predict as predict
     from .errors import InputError as InputError
     from .feasible import Bounds as Bounds
     from .identification import Identification as Identification
@@ -35,11 +39,15 @@ if TYPE_CHECKING:
 _HOME = {
     "Arm": "arm",
     "Bounds": "feasible",
+    "Corrected": "corrected",
+    "Diagnosis": "diagnosis",
     "Identification": "identification",
     "InputError": "errors",
     "Recording": "recordings",
     "Retrieval": "retrieval",
     "demonstrate": "demo",
+    "diagnose": "diagnosis",
+    "predict": "diagnosis",
     "identify": "identification",
     "identify_mass_gravity": "identification",
     "inspect": "inspection",

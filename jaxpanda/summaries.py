@@ -174,6 +174,78 @@ def validation(checked: Any) -> Sequence[Section]:
     return [Section("Validation", sentences, [_by_joint("", names, columns)], figures)]
 
 
+def diagnosis(found: Any) -> Sequence[Section]:
+    """Verdict, each finding with its numbers, and the fit before and after."""
+    document = found.to_json()
+    names = found.corrected.arm.joint_names
+    fit = document["fit"]
+    sections = [
+        Section(
+            "Verdict",
+            found.lines(),
+            [
+                _by_joint(
+                    "Torque error in the band of the diagnosis [N m]",
+                    names,
+                    {
+                        "before": fit["rmse_before"],
+                        "after": fit["rmse_after"],
+                        "held out, before": fit["held_out_rmse_before"],
+                        "held out, after": fit["held_out_rmse_after"],
+                        "noise floor": fit["noise_floor"],
+                    },
+                )
+            ],
+            [
+                residual_figure(name, time, before, after, names)
+                for name, time, before, after in found.residuals()
+            ],
+        )
+    ]
+    sections += [_finding(i, one, names) for i, one in enumerate(document["findings"])]
+    notes = [*document["notes"]]
+    return [*sections, Section("Notes", notes)] if notes else sections
+
+
+def _finding(place: int, one: Mapping[str, Any], names: Sequence[str]) -> Section:
+    sentences = [one["summary"], f"Equation: {one['equation']}", f"Confidence: {one['confidence']:.2f}."]
+    if one["intervals"]:
+        spans = ", ".join(f"{a:.2f} to {b:.2f} s" for a, b in one["intervals"])
+        sentences.append(f"In {', '.join(one['recordings'])}, from {spans}.")
+    if one["alternatives"]:
+        rivals = ", ".join(f"{a['effect']} ({a['confidence']:.2f})" for a in one["alternatives"])
+        sentences.append(f"What else it could be: {rivals}.")
+    rows = [
+        [p["name"], number(p["joint"]), number(p["value"]), number(p.get("std"), 2), p["unit"]]
+        for p in one["parameters"]
+    ]
+    tables = [Table(["parameter", "joint", "value", "std", "unit"], rows)] if rows else []
+    tables.append(_by_joint("Torque that it explains, rms [N m]", names, {"rms": one["rms_torque"]}))
+    return Section(f"{place + 1}. {one['effect'].replace('_', ' ')}", sentences, tables)
+
+
+def residual_figure(
+    name: str,
+    time: Float[np.ndarray, " time"],
+    before: Float[np.ndarray, "time dof"],
+    after: Float[np.ndarray, "time dof"],
+    names: Sequence[str],
+) -> Figure:
+    """What the model leaves of the torque, before and after, joint by joint."""
+
+    def draw(canvas: Any) -> None:
+        axes = canvas.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        thin = max(1, len(time) // 2000)
+        for j, axis in enumerate(axes):
+            axis.plot(time[::thin], before[::thin, j], color="C1", label="your simulation")
+            axis.plot(time[::thin], after[::thin, j], color="C0", label="corrected")
+            axis.set_ylabel(f"{names[j]} [N m]")
+        axes[0].legend(loc="upper right", ncols=2)
+        axes[-1].set_xlabel("time [s]")
+
+    return Figure(draw, f"{name}: what is left of the measured torque", size=(10.0, 1.3 * len(names)))
+
+
 def _by_joint(caption: str, names: Sequence[str], columns: Mapping[str, Any]) -> Table:
     present = {head: values for head, values in columns.items() if values is not None and len(values)}
     rows = [[name, *(number(values[i]) for values in present.values())] for i, name in enumerate(names)]
@@ -237,7 +309,7 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Retrieval": retrieval,
     "Export": export,
     "Validation": validation,
-    "Diagnosis": lambda result: [Section("Diagnosis", result.lines())],
+    "Diagnosis": diagnosis,
     "Prediction": lambda result: [Section("Prediction", result.lines())],
     "Demonstration": lambda result: result.sections,
 }

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from .. import report, summaries
 from ..errors import InputError
-from ..files import write_text
+from ..files import output_folder, write_text
 from ..recordings import load, load_many
 from .diagnosis import Diagnosis, diagnose, predict
 from .knowledge import Knowledge
@@ -45,8 +46,10 @@ def diagnose_files(
     """`jaxpanda diagnose`."""
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
-    found = diagnose(model, load_many(recordings), reference=load_many(reference), knowledge=knowledge)
-    found.save(out)
+    with output_folder(out) as folder:
+        found = diagnose(model, load_many(recordings), reference=load_many(reference), knowledge=knowledge)
+        found.save(folder)
+        report.to_html("jaxpanda: diagnosis", summaries.diagnosis(found), folder / "report.html")
     return found
 
 

@@ -86,14 +86,14 @@ class Diagnosis:
         return [sentence, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]
 
     def save(self, folder: str | Path) -> None:
-        """Write diagnosis.json, corrected.xml and corrected.json; all or nothing."""
-        with files.output_folder(folder) as scratch:
-            files.write_json(scratch / "diagnosis.json", self.to_json())
-            files.write_text(scratch / "corrected.xml", self.corrected_xml)
-            files.write_json(
-                scratch / CORRECTED,
-                {**self.corrected.to_json(), "torque_noise": [float(v) for v in self.fit.noise_floor]},
-            )
+        """Write diagnosis.json, corrected.xml and corrected.json."""
+        folder = Path(folder)
+        files.write_json(folder / "diagnosis.json", self.to_json())
+        files.write_text(folder / "corrected.xml", self.corrected_xml)
+        files.write_json(
+            folder / CORRECTED,
+            {**self.corrected.to_json(), "torque_noise": [float(v) for v in self.fit.noise_floor]},
+        )
 
 
 def diagnose(
