@@ -59,7 +59,6 @@ _HOME = {
     "to_mjcf": "pipeline",
     "validate": "validation",
 }
-__all__ = [*_HOME]
 
 
 def __getattr__(name: str) -> Any:
