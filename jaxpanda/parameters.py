@@ -109,7 +109,7 @@ def base_parameters(
     columns = W.shape[1]
     R = np.linalg.qr(np.asarray(W, float), mode="r")
     norms = np.linalg.norm(R, axis=0)
-    felt = norms > 1e-12 * max(norms.max(initial=0.0), 1e-300)
+    felt = norms > tolerance * max(norms.max(initial=0.0), 1e-300)
     scaled = R / np.where(felt, norms, 1.0) * felt
     singular_values = np.linalg.svd(scaled, compute_uv=False)
     rank = independent

@@ -233,6 +233,23 @@ def test_an_arm_at_rest_tells_gravity_only_and_says_so():
     assert np.all(np.isfinite(result.beta))
 
 
+def test_a_recording_of_one_pose_is_fitted_in_parameters_that_it_shows():
+    # The pose's independent columns need not be those that the arm's own base parameters are named after.
+    arm = panda()
+    q = np.full((1500, 7), 0.1)
+    tau = np.asarray(gravity_torque(arm.chain, arm.standard, jnp.asarray(q[0])))
+    still = Recording("still.csv", np.arange(1500) / 500.0, q, None, np.tile(tau, (1500, 1)))
+    result = identify(still, arm, friction="none", folds=0)
+    assert result.rank == np.count_nonzero(np.abs(tau) > 1e-9)
+    assert result.relative_error_percent < 1e-6
+
+
+@pytest.mark.parametrize("folds", [1, -3])
+def test_folds_that_cannot_be_are_refused(folds):
+    with pytest.raises(InputError, match="folds"):
+        identify(virtual(panda(), 4.0), panda(), folds=folds)
+
+
 def test_friction_of_a_joint_that_does_not_move_is_not_made_up():
     recording = virtual(panda(), 14.0)
     q = recording.q.copy()

@@ -13,6 +13,7 @@ import json
 import runpy
 import sys
 import time
+import warnings
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -56,7 +57,9 @@ def call(arguments):
     before = sys.argv
     sys.argv = ["jaxpanda", *map(str, arguments)]
     status = 0
-    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), warnings.catch_warnings():
+        # runpy warns where the module was imported before, which does no harm here
+        warnings.filterwarnings("ignore", message=".*found in sys.modules", category=RuntimeWarning)
         try:
             runpy.run_module("jaxpanda", run_name="__main__")
         except SystemExit as end:

@@ -26,7 +26,7 @@ from ..arm import Arm
 from ..errors import InputError, require_x64
 from ..parameters import base_parameters
 from .regression import triangle
-from .result import RELIABLE, Identification, of_model
+from .result import RELIABLE, Identification, check_folds, of_model
 
 _SYMMETRIC = 1e-6  # of the largest entry of M
 _GRAVITIES = (0.98, 1.02)  # of the given gravity, between which the data's own is looked for
@@ -190,12 +190,13 @@ def identify_mass_gravity(
         arm: for its geometry.
         gravity: magnitude to assume [m/s²]; the arm's own by default. `settings["preferred_gravity"]` of the
             result says which one the data fit best.
-        folds: of the cross-validation over blocks of neighbouring samples.
+        folds: of the cross-validation over blocks of neighbouring samples. 0 leaves it out.
 
     Raises:
         InputError: a malformed table, or one of another arm.
     """
     require_x64("identification")
+    check_folds(folds)
     samples = _as_samples(source, arm)
     if samples.q.shape[1] != arm.dof:
         raise InputError(
@@ -219,7 +220,7 @@ def identify_mass_gravity(
     residual = y - A @ beta
     covariance = residual @ residual / max(len(y) - base.rank, 1) * np.linalg.inv(A.T @ A)
     std = np.sqrt(np.diag(covariance))
-    held_out = _cross_validate(A, y, len(samples.q), len(mass), folds)
+    held_out = _cross_validate(A, y, len(samples.q), len(mass), folds) if folds else None
     settings = {"gravity": gravity or own, "samples": len(samples.q), "folds": folds}
     if len(mass) and len(weight):
         scale, error = _preferred_gravity(A, y, len(mass))
@@ -241,8 +242,8 @@ def identify_mass_gravity(
         condition_number=float(np.linalg.cond(A)),
         relative_error_percent=_percent(residual, y),
         rmse=_rms_of_gravity(residual, len(mass), arm.dof),
-        cross_validated_rmse=_rms_of_gravity(held_out, len(mass), arm.dof),
-        cross_validated_relative_error_percent=_percent(held_out, y),
+        cross_validated_rmse=None if held_out is None else _rms_of_gravity(held_out, len(mass), arm.dof),
+        cross_validated_relative_error_percent=None if held_out is None else _percent(held_out, y),
         known=of_model(arm),
         arm=arm.name,
         link_names=arm.link_names,

@@ -130,17 +130,27 @@ def everything(regressions: Sequence[Regression]) -> Masks:
 def excited(regressions: Sequence[Regression], base: Base) -> tuple[list[Regression], Base]:
     """The problem in as many base parameters as the recordings excite, exactly the given ones if all of them.
 
-    A recording at rest, say, tells gravity parameters only.
+    A recording at rest, say, tells gravity parameters only. A column of the smaller base is the torque of a
+    standard parameter, which need not be one that the arm's own base is named after.
+
+    Raises:
+        InputError: the motion shows some parameters so weakly that their number is not clear.
     """
     R = np.concatenate(triangles(regressions, everything(regressions)))[:, : base.rank]
     norms = np.linalg.norm(R, axis=0)
     s = np.linalg.svd(R / np.where(norms > 0, norms, 1), compute_uv=False)
     if norms.all() and s[-1] > UNDETERMINED * s[0]:
         return list(regressions), base
-    fewer = base_parameters(R @ base.projection, tolerance=UNDETERMINED)
-    places = [base.independent.index(k) for k in fewer.independent]
-    rest = range(base.rank, regressions[0].A.shape[2])
-    return [dataclasses.replace(r, A=r.A[:, :, [*places, *rest]]) for r in regressions], fewer
+    try:
+        fewer = base_parameters(R @ base.projection, tolerance=UNDETERMINED)
+    except RuntimeError as error:
+        names = ", ".join(r.name for r in regressions)
+        raise InputError(f"{names}: {error}; record a motion of all joints") from None
+    columns = base.projection[:, list(fewer.independent)]
+    reduced = [
+        np.concatenate([r.A[:, :, : base.rank] @ columns, r.A[:, :, base.rank :]], 2) for r in regressions
+    ]
+    return [dataclasses.replace(r, A=A) for r, A in zip(regressions, reduced, strict=True)], fewer
 
 
 def triangles(regressions: Sequence[Regression], masks: Masks) -> Float[np.ndarray, "dof rows columns"]:

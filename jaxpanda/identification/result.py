@@ -221,6 +221,12 @@ def of_model(arm: Arm) -> dict[str, Float[np.ndarray, " dof"]]:
     return {name: np.asarray(getattr(arm, name)) for name in KNOWN}
 
 
+def check_folds(folds: int) -> None:
+    """Refuse a cross-validation that cannot be."""
+    if folds < 0 or folds == 1:
+        raise InputError(f"folds: {folds} cannot be; at least 2, or 0 for no cross-validation")
+
+
 def _listed(values: np.ndarray | None) -> list[float]:
     return [] if values is None else [float(value) for value in values]
 

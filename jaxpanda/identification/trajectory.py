@@ -18,7 +18,7 @@ from ..recordings import Recording
 from ..signals import Signals, blocks_many, prepare, repeatability
 from .one_step import PRIOR, Prior, feasible_least_squares
 from .regression import Fit, Masks, Regression, everything, excited, least_squares, regression, triangle
-from .result import RELIABLE, Identification, of_model
+from .result import RELIABLE, Identification, check_folds, of_model
 from .sigmoid import Shape, fit_shape, linearised, with_shape
 from .statistics import covariances, determined
 
@@ -76,6 +76,7 @@ def identify(
     ):
         if value not in known:
             raise InputError(f"{name}: {value!r} is none of {', '.join(known)}")
+    check_folds(folds)
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not recordings:
         raise InputError("recordings: none given; identification needs at least one")
