@@ -80,13 +80,18 @@ class Base:
     @property
     def terms(self) -> list[dict[str, float]]:
         """Each base parameter as a linear form: standard parameter to coefficient."""
-        names = standard_names(self.dof)
-        return [{names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in self.projection]
+        return linear_forms(self.projection)
 
     @property
     def expressions(self) -> list[str]:
         """Each base parameter as the literature prints it, as in `J2yy + J1zz`."""
         return [expression(terms) for terms in self.terms]
+
+
+def linear_forms(projection: Float[np.ndarray, "base standard"]) -> list[dict[str, float]]:
+    """Rows of K as linear forms: name of the standard parameter to coefficient."""
+    names = standard_names(projection.shape[1] // 10)
+    return [{names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in projection]
 
 
 def base_parameters(

@@ -152,6 +152,10 @@ def test_bad_calls_say_what_would_work():
         diagnose(None, [])
     with pytest.raises(InputError, match="exact, identified"):
         check("perfect")
+    live = record(0)
+    stuck = dataclasses.replace(live, tau=np.where(np.arange(7) == 4, 0.3, live.tau))
+    with pytest.raises(InputError, match="tau_5 never changes"):
+        diagnose(None, [stuck])
     with pytest.raises(InputError, match="tau_1"):
         diagnose(None, [dataclasses.replace(record(0), tau=None)])
 

@@ -127,7 +127,7 @@ def diagnose(
         for one in group:
             recording = one if isinstance(one, Recording) else load(one)
             recording.require_dof(arm.dof)
-            recording.require_tau()
+            _require_live_torque(recording)
             traces.append(prepare(recording, arm))
             active.append(on)
     problem, spread = pose(tuple(traces), tuple(active), knowledge)
@@ -148,6 +148,18 @@ def diagnose(
         problem=problem,
         state=state,
     )
+
+
+def _require_live_torque(recording: Recording) -> None:
+    """Refuse torque that is absent, or a channel that is stuck: without noise nothing tells what is beyond it."""
+    recording.require_tau()
+    assert recording.tau is not None
+    stuck = np.flatnonzero(np.ptp(recording.tau, axis=0) == 0)
+    if len(stuck):
+        raise InputError(
+            f"{recording.name}: column tau_{stuck[0] + 1} never changes; a diagnosis needs torque as the sensor"
+            " gave it, with its noise"
+        )
 
 
 def pose(

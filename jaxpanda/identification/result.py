@@ -12,7 +12,7 @@ from ..arm import KNOWN, Arm
 from ..errors import InputError
 from ..files import finite, read_json, write_json
 from ..friction import Friction
-from ..parameters import coefficient_matrix, expression, standard_names
+from ..parameters import coefficient_matrix, expression, linear_forms
 
 SCHEMA = "jaxpanda.identification/1"
 FILE = "identification.json"
@@ -84,8 +84,7 @@ class Identification:
     @property
     def terms(self) -> list[dict[str, float]]:
         """Each coefficient as a linear form: standard parameter to number."""
-        names = standard_names(self.dof)
-        return [{names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in self.projection]
+        return linear_forms(self.projection)
 
     @property
     def coefficients(self) -> list[dict[str, Any]]:
