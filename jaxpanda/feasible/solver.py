@@ -131,7 +131,7 @@ def solve(
     if starts < 1:
         raise InputError(f"starts: {starts} is too few; at least 1")
     chunk = min(chunk, starts)
-    x0 = _initial(problem, bounds, initial, starts, seed)
+    x0 = starting_points(problem, bounds, starts, seed, initial=initial)
     padded = jnp.concatenate([x0, jnp.broadcast_to(x0[-1], ((-starts) % chunk, x0.shape[1]))])
     began = time.perf_counter()
     leaves, structure = jax.tree.flatten((problem, padded[:chunk]))
@@ -142,16 +142,15 @@ def solve(
         chunks.append(jax.device_get(run(problem, padded[first : first + chunk])))
         if progress is not None:
             progress(min(first + chunk, starts), starts)
-    parts = (np.concatenate(part)[:starts] for part in zip(*chunks, strict=True))
-    phi, extra, violation, converged, accepted = parts
-    residual = np.concatenate([phi.reshape(starts, -1), extra], -1) @ A.T - b
+    found = jax.tree.map(lambda *parts: np.concatenate(parts)[:starts], *chunks)
+    residual = np.concatenate([found.phi.reshape(starts, -1), found.extra], -1) @ A.T - b
     return Solutions(
-        phi=phi,
-        extra=extra,
+        phi=found.phi,
+        extra=found.extra,
         objective=np.sum(residual**2, -1),
-        violation=violation,
-        converged=converged,
-        iterations=accepted,
+        violation=found.violation,
+        converged=found.converged,
+        iterations=found.iterations,
         compile_seconds=compiled - began,
         run_seconds=time.perf_counter() - compiled,
     )
@@ -250,23 +249,36 @@ def _root_inertia(bounds: Bounds) -> Float[np.ndarray, " dof"]:
     return radius * np.sqrt(bounds.mass.mean(-1))
 
 
-def _initial(
+def starting_points(
     problem: Problem,
     bounds: Bounds,
-    initial: Float[np.ndarray, "given dof 10"] | None,
     starts: int,
     seed: int,
+    *,
+    first: int = 0,
+    initial: Float[np.ndarray, "given dof 10"] | None = None,
 ) -> Float[Array, "starts columns"]:
-    """Random points of the box, the given ones first."""
-    keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(seed), i))(jnp.arange(starts))
-    x0 = jax.vmap(lambda key: _random_start(problem, jnp.asarray(bounds.mass.mean(-1)), key))(keys)
+    """Starts number `first`, `first` + 1, ...: random points of the box, the given ones in place of the first.
+
+    A start depends on its number and the seed alone.
+    """
+    middling = jnp.asarray(bounds.mass.mean(-1))
+    x0 = _random_starts(problem, middling, jax.random.key(seed), first + jnp.arange(starts))
     if initial is None:
         return x0
     if initial.shape[1:] != (problem.dof, 10):
         raise InputError(f"initial parameters: expected shape (n, {problem.dof}, 10), got {initial.shape}")
-    given = jax.vmap(jax.vmap(_coordinates))(jnp.asarray(initial[:starts])).reshape(-1, 10 * problem.dof)
+    initial = initial[first : first + starts]
+    given = jax.vmap(jax.vmap(_coordinates))(jnp.asarray(initial)).reshape(-1, 10 * problem.dof)
     given = jnp.concatenate([given, x0[: len(given), 10 * problem.dof :]], -1)
     return x0.at[: len(given)].set(jnp.clip(given, problem.lower, problem.upper))
+
+
+@jax.jit
+def _random_starts(
+    problem: Problem, middling: Float[Array, " dof"], key: Key[Array, ""], numbers: Int[Array, " starts"]
+) -> Float[Array, "starts columns"]:
+    return jax.vmap(lambda i: _random_start(problem, middling, jax.random.fold_in(key, i)))(numbers)
 
 
 def _random_start(
@@ -507,6 +519,28 @@ def _step(problem: Problem, state: _State, multipliers: _Margins, weight: Float[
     )
 
 
+class Outcome(eqx.Module):
+    """What the starts of a chunk came to."""
+
+    phi: Float[Array, "starts dof 10"]
+    extra: Float[Array, "starts extra"]
+    violation: Float[Array, " starts"]
+    converged: Bool[Array, " starts"]
+    iterations: Int[Array, " starts"]
+
+
+def solve_chunk(
+    problem: Problem,
+    x0: Float[Array, "starts columns"],
+    *,
+    rounds: int = ROUNDS,
+    iterations: int = ITERATIONS,
+) -> Outcome:
+    """Minimise from every point of `x0`; a pure function to be compiled, no start knows of another."""
+    run = jax.vmap(lambda x0: _run_one(problem, x0, rounds, iterations))
+    return Outcome(*run(x0))
+
+
 def _run_one(problem: Problem, x0: Float[Array, " columns"], rounds: int, iterations: int):
     """One start: Newton steps in rounds, with the multipliers updated after each."""
     n = 10 * problem.dof
@@ -543,5 +577,5 @@ def _run_one(problem: Problem, x0: Float[Array, " columns"], rounds: int, iterat
 def _compiled(structure: Any, leaves: tuple[tuple[Any, Any], ...], rounds: int, iterations: int) -> Callable:
     """The program for a chunk of starts; kept, because cross-validation solves one shape many times."""
     problem, x0 = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
-    run = jax.jit(jax.vmap(lambda problem, x0: _run_one(problem, x0, rounds, iterations), in_axes=(None, 0)))
+    run = jax.jit(lambda problem, x0: solve_chunk(problem, x0, rounds=rounds, iterations=iterations))
     return run.lower(problem, x0).compile()
