@@ -23,10 +23,8 @@ Every start does the same work, so that a batch of them is a batch of small dens
 """
 
 import dataclasses
-import functools
-import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -36,7 +34,9 @@ from jaxpanda_kernels import inertia
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..errors import InputError, require_x64
+from . import schedule
 from .bounds import Bounds
+from .checkpoint import Checkpoint, identity
 from .constraints import Constraint, Links, triangle_inequality
 
 STARTS = 2048
@@ -46,6 +46,7 @@ ROUNDS = 4
 ITERATIONS = 25
 """Newton steps a round; after each round the multipliers of the constraints are updated."""
 
+_BLOCK = 4096  # starts whose objective is evaluated at once
 _TRIANGLE_INSET = 1e-8  # [kg m²]
 _COM_INSET = 1e-9  # [m]: m c / m need not give c to the last bit
 _MARGIN_INSET = 1e-6  # in the constraint's own unit
@@ -104,6 +105,8 @@ def solve(
     chunk: int = CHUNK,
     rounds: int = ROUNDS,
     iterations: int = ITERATIONS,
+    devices: Sequence[schedule.Device] | None = None,
+    checkpoint: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Solutions:
     """Minimise the sum of squares from many random starts at once.
@@ -118,42 +121,62 @@ def solve(
         initial: parameters to start from in place of as many random starts; moved into the boxes.
         starts: number of starts.
         seed: same seed, same answer, whatever the chunk.
-        chunk: how many starts are solved at once; bounds the memory.
+        chunk: how many starts are solved at once on each device; bounds the memory.
         rounds: how often the constraints' multipliers are updated.
         iterations: Newton steps a round.
+        devices: over which the starts are spread; see `schedule.run`.
+        checkpoint: file that keeps the starts as they finish. Where it holds starts of this same problem from a
+            run that was interrupted, they are not solved again, and the answer has the same bits. The caller
+            removes it.
         progress: called with (starts done, starts) after every chunk.
 
     Raises:
-        InputError: shapes do not fit each other, or a number is not finite.
+        InputError: shapes do not fit each other, a number is not finite, or the checkpoint is of another problem.
     """
     require_x64("feasible.solve")
     problem = scaled_problem(A, b, bounds, tuple(constraints), extra_lower, extra_upper)
     if starts < 1:
         raise InputError(f"starts: {starts} is too few; at least 1")
-    chunk = min(chunk, starts)
-    x0 = starting_points(problem, bounds, starts, seed, initial=initial)
-    padded = jnp.concatenate([x0, jnp.broadcast_to(x0[-1], ((-starts) % chunk, x0.shape[1]))])
-    began = time.perf_counter()
-    leaves, structure = jax.tree.flatten((problem, padded[:chunk]))
-    run = _compiled(structure, tuple((x.shape, x.dtype) for x in leaves), rounds, iterations)
-    compiled = time.perf_counter()
-    chunks = []
-    for first in range(0, starts, chunk):
-        chunks.append(jax.device_get(run(problem, padded[first : first + chunk])))
-        if progress is not None:
-            progress(min(first + chunk, starts), starts)
-    found = jax.tree.map(lambda *parts: np.concatenate(parts)[:starts], *chunks)
-    residual = np.concatenate([found.phi.reshape(starts, -1), found.extra], -1) @ A.T - b
+    steps = (rounds, iterations)
+    kept = None
+    if checkpoint is not None:
+        further = (extra_lower, extra_upper, initial)
+        kept = Checkpoint(checkpoint, identity(A, b, bounds, constraints, further, seed, steps))
+    found, compile_seconds, run_seconds = schedule.run(
+        _solve_starts,
+        _origin(problem, bounds, seed, initial),
+        steps,
+        starts=starts,
+        chunk=chunk,
+        devices=devices,
+        checkpoint=kept,
+        progress=progress,
+    )
     return Solutions(
         phi=found.phi,
         extra=found.extra,
-        objective=np.sum(residual**2, -1),
+        objective=_objectives(A, b, found.phi, found.extra),
         violation=found.violation,
         converged=found.converged,
         iterations=found.iterations,
-        compile_seconds=compiled - began,
-        run_seconds=time.perf_counter() - compiled,
+        compile_seconds=compile_seconds,
+        run_seconds=run_seconds,
     )
+
+
+def _objectives(
+    A: Float[np.ndarray, "rows columns"],
+    b: Float[np.ndarray, " rows"],
+    phi: Float[np.ndarray, "starts dof 10"],
+    extra: Float[np.ndarray, "starts extra"],
+) -> Float[np.ndarray, " starts"]:
+    """In blocks, which bounds the memory; always the same ones, for the same bits."""
+    objective = np.empty(len(phi))
+    for first in range(0, len(phi), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        x = np.concatenate([phi[block].reshape(len(phi[block]), -1), extra[block]], -1)
+        objective[block] = np.sum((x @ A.T - b) ** 2, -1)
+    return objective
 
 
 class Problem(eqx.Module):
@@ -262,23 +285,47 @@ def starting_points(
 
     A start depends on its number and the seed alone.
     """
-    middling = jnp.asarray(bounds.mass.mean(-1))
-    x0 = _random_starts(problem, middling, jax.random.key(seed), first + jnp.arange(starts))
-    if initial is None:
+    drawn = jax.jit(jax.vmap(_start, in_axes=(None, 0)))
+    return drawn(_origin(problem, bounds, seed, initial), first + jnp.arange(starts))
+
+
+class _Origin(eqx.Module):
+    """Where starts come from."""
+
+    problem: Problem
+    middling: Float[Array, " dof"]
+    """Masses in the middle of their boxes [kg]."""
+    given: Float[Array, "given links"]
+    """Links' coordinates to start from in place of random ones."""
+    seed: Int[Array, ""]
+
+
+def _origin(
+    problem: Problem, bounds: Bounds, seed: int, initial: Float[np.ndarray, "given dof 10"] | None
+) -> _Origin:
+    given = jnp.zeros((0, 10 * problem.dof))
+    if initial is not None:
+        if initial.shape[1:] != (problem.dof, 10):
+            raise InputError(
+                f"initial parameters: expected shape (n, {problem.dof}, 10), got {initial.shape}"
+            )
+        given = jax.jit(jax.vmap(jax.vmap(_coordinates)))(jnp.asarray(initial)).reshape(len(initial), -1)
+    return _Origin(problem, jnp.asarray(bounds.mass.mean(-1)), given, jnp.asarray(seed))
+
+
+def _start(origin: _Origin, number: Int[Array, ""]) -> Float[Array, " columns"]:
+    """A given point where there is one of this number, else a random point of the box."""
+    problem, given = origin.problem, origin.given
+    x0 = _random_start(problem, origin.middling, jax.random.fold_in(jax.random.key(origin.seed), number))
+    if not len(given):
         return x0
-    if initial.shape[1:] != (problem.dof, 10):
-        raise InputError(f"initial parameters: expected shape (n, {problem.dof}, 10), got {initial.shape}")
-    initial = initial[first : first + starts]
-    given = jax.vmap(jax.vmap(_coordinates))(jnp.asarray(initial)).reshape(-1, 10 * problem.dof)
-    given = jnp.concatenate([given, x0[: len(given), 10 * problem.dof :]], -1)
-    return x0.at[: len(given)].set(jnp.clip(given, problem.lower, problem.upper))
+    replaced = x0.at[: given.shape[1]].set(given[jnp.minimum(number, len(given) - 1)])
+    return jnp.where(number < len(given), jnp.clip(replaced, problem.lower, problem.upper), x0)
 
 
-@jax.jit
-def _random_starts(
-    problem: Problem, middling: Float[Array, " dof"], key: Key[Array, ""], numbers: Int[Array, " starts"]
-) -> Float[Array, "starts columns"]:
-    return jax.vmap(lambda i: _random_start(problem, middling, jax.random.fold_in(key, i)))(numbers)
+def _solve_starts(origin: _Origin, numbers: Int[Array, " chunk"], rounds: int, iterations: int) -> "Outcome":
+    x0 = jax.vmap(lambda number: _start(origin, number))(numbers)
+    return solve_chunk(origin.problem, x0, rounds=rounds, iterations=iterations)
 
 
 def _random_start(
@@ -571,11 +618,3 @@ def _run_one(problem: Problem, x0: Float[Array, " columns"], rounds: int, iterat
     late = values[-1, iterations // 2] - values[-1, -1]
     settled = late <= 1e-3 * values[-1, -1] + 1e-12 * problem.b @ problem.b
     return phi, state.x[n:], violation, settled & (violation == 0), state.accepted
-
-
-@functools.lru_cache(maxsize=16)
-def _compiled(structure: Any, leaves: tuple[tuple[Any, Any], ...], rounds: int, iterations: int) -> Callable:
-    """The program for a chunk of starts; kept, because cross-validation solves one shape many times."""
-    problem, x0 = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
-    run = jax.jit(lambda problem, x0: solve_chunk(problem, x0, rounds=rounds, iterations=iterations))
-    return run.lower(problem, x0).compile()
