@@ -88,7 +88,7 @@ class Corrected(eqx.Module):
         out = []
         for effect, c in zip(self.effects, self.coefficients, strict=True):
             held = hasattr(effect, "standard_change") or effect.mjcf(np.asarray(c), self.arm)
-            if not held and not effect.sensor and not effect.bound_to_recording:
+            if not held and effect.acts_on == "plant" and not effect.bound_to_recording:
                 out.append((effect, c))
         return tuple(out)
 

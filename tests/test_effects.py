@@ -19,7 +19,7 @@ from jaxpanda.effects import (
     joint_columns,
 )
 from jaxpanda.effects.contact import ExternalContact
-from jaxpanda.effects.drive import JointElasticity, TorqueRipple
+from jaxpanda.effects.drive import Backlash, JointElasticity, TorqueRipple
 from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.load import GravityDirection, InertialParameters, Payload, PayloadChange
 from jaxpanda.effects.memory import PreslidingHysteresis
@@ -205,3 +205,61 @@ def test_a_stiff_joint_deflects_by_its_torque_over_its_stiffness(motion):
     dq[:, 1] = -motion.load[:, 1]
     expected = motion.sensitivity(dq)[50:-50]
     assert np.abs(found - expected).max() < 0.05 * np.abs(expected).max()
+
+
+def test_what_a_simulation_applies_is_what_inverse_dynamics_has(arm, motion, channels):
+    """Along a motion, resistance and damping of the step add up to the columns times the coefficients."""
+    for effect in shapes(arm):
+        if (
+            effect.acts_on != "plant"
+            or hasattr(effect, "standard_change")
+            or effect.name == "gravity_direction"
+        ):
+            continue  # what MJCF holds natively
+        c = jnp.linspace(0.3, 0.5, len(effect.coefficients))
+
+        def step(z, s, effect=effect, c=c):
+            done = effect.resist(c, arm, z, s, motion.dt)
+            return done.state, done.torque + done.damping * s.qd
+
+        z = effect.begin(c, arm, jax.tree.map(lambda a: jnp.asarray(a[0]), channels))
+        found = jax.jit(lambda s, z=z, step=step: jax.lax.scan(step, z, s)[1])(channels)
+        expected = columns(effect, motion, channels) @ np.asarray(c)
+        np.testing.assert_allclose(found, expected, atol=1e-9, err_msg=str(effect))
+
+
+def test_torque_sensors_show_what_the_columns_add(arm, motion, channels):
+    for effect in shapes(arm):
+        if effect.acts_on != "torque":
+            continue
+        d = 0.02  # a delay of two samples is where its column is exact
+        c = jnp.full(1, -effect.around if effect.name == "time_delay" else d)
+        c = jnp.linspace(d, 2 * d, len(effect.coefficients)) if effect.name != "time_delay" else -c
+        shown = effect.sensed(c, jnp.asarray(motion.time), jnp.asarray(motion.torque))
+        expected = motion.torque + columns(effect, motion, channels) @ np.asarray(c)
+        np.testing.assert_allclose(shown, expected, atol=1e-9, err_msg=str(effect))
+        back = effect.true(c, jnp.asarray(motion.time), shown)
+        inside = slice(10, -10)  # a delay does not know what was before and after
+        np.testing.assert_allclose(back[inside], motion.torque[inside], atol=0.05, err_msg=str(effect))
+
+
+def test_a_position_sensor_beyond_a_spring_shows_the_motion_that_takes_the_torque(arm, motion):
+    """The columns, on what the sensor shows of a motion, give the torque of the motion itself."""
+    K = 4000.0
+    for effect, c in (
+        (JointElasticity(1, K, 0.2), 1 / K),
+        (Backlash(3, 0.01, "load-driven"), 0.01),
+        (EncoderOffset(2, 0.05), 0.05),
+    ):
+        c = jnp.full(1, c)
+        s = Channels(motion.time, motion.q, motion.qd, motion.qdd, motion.torque, motion.torque)
+        z = effect.begin(c, arm, jax.tree.map(lambda a: jnp.asarray(a[0]), s))
+
+        def step(z, s, effect=effect, c=c):
+            return effect.shift(c, arm, z, s, motion.dt)[::-1]
+
+        shown = motion.moved(np.asarray(jax.lax.scan(step, z, s)[1]))
+        left = shown.load + effect.over(shown) @ np.asarray(c) - motion.load
+        before = shown.load - motion.load
+        middle = slice(60, -60)
+        assert np.abs(left[middle]).max() < 0.1 * np.abs(before[middle]).max(), effect

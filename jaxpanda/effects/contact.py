@@ -5,13 +5,15 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxpanda_kernels import link_poses
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractArmEffect, Coefficient, Shape
+from .effect import AbstractArmEffect, Coefficient, Resistance, Shape
 from .load import window
-from .motion import Motion
+from .motion import Motion, wrench_columns
 
 
 class ExternalContact(AbstractArmEffect):
@@ -90,6 +92,18 @@ class ExternalContact(AbstractArmEffect):
             force, moment = force @ R, moment @ R if moment.shape[-1] else moment
         columns = np.concatenate([force, moment], -1)
         return columns * window(motion.time, float(self.start), float(self.stop), motion.dt)[:, None, None]
+
+    def resist(self, c, arm, z, s, dt):
+        q = jnp.asarray(s.q)
+        R = link_poses(arm.chain, q)[0][self.link]
+        point = self.form.startswith("point")
+        force, moment = c[:3], jnp.cross(jnp.array(self.point), c[:3]) if point else c[3:]
+        if not self.form.endswith("link"):  # along the base's axes: only the lever turns with the link
+            moment = jnp.cross(R @ jnp.array(self.point), force) if point else moment
+        else:
+            force, moment = R @ force, R @ moment
+        torque = wrench_columns(arm, q)[self.link] @ jnp.concatenate([force, moment])
+        return Resistance(torque * window(s.t, self.start, self.stop, dt), jnp.zeros_like(s.q), z)
 
     def parameters(self, c, covariance) -> list[dict[str, Any]]:
         joint = self.link + 1

@@ -2,15 +2,16 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxpanda_kernels import mass_matrix
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape
+from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape, smooth_sign
 from .motion import Channels, Joint, Motion
 
 
@@ -164,6 +165,7 @@ class JointElasticity(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "joint_elasticity"
+    acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("stiffness", "N·m/rad", 50.0, 1e6),)
     reveals: ClassVar[str] = (
         "heavy and light load in the same pose; bursts of high frequency; both encoders, if any"
@@ -213,6 +215,25 @@ class JointElasticity(AbstractArmEffect):
         dq[:, j] = -np.fft.irfft(np.fft.rfft(load) * smooth / spring, len(load))[: motion.samples] / K
         return K * (motion.moved(dq).load - motion.load)[..., None]
 
+    def begin(self, c, arm, s):
+        inertia = (
+            mass_matrix(arm.chain, arm.standard, jnp.asarray(s.q))[self.joint, self.joint]
+            + arm.armature[self.joint]
+        )
+        settling = 2 * self.damping_ratio * jnp.sqrt(inertia / self.stiffness)
+        return jnp.stack([s.load[self.joint], settling])
+
+    def shift(self, c, arm, z, s, dt):
+        r"""The sensor runs ahead of the link by the spring's deflection under the torque it transmits.
+
+        $d\,\dot\delta + K\,\delta = \tau$, solved exactly over the step. Nothing is left out where the torque is
+        the one on the link's side; inertia between motor and sensor is taken for part of the link.
+        """
+        load, settling = z
+        load = s.load[self.joint] + (load - s.load[self.joint]) * jnp.exp(-dt / settling)
+        ahead = jnp.zeros_like(s.q).at[self.joint].set(c[0] * load)
+        return ahead, jnp.stack([load, settling])
+
 
 _DEFLECTION_CUTOFF = 6.0
 """Low-pass of a joint's deflection [Hz]."""
@@ -230,6 +251,7 @@ class Backlash(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "backlash"
+    acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("half_width", "rad", 1e-4, 0.1),)
     reveals: ClassVar[str] = "slow motion through poses where the load changes sign"
     confounded_with: ClassVar[tuple[str, ...]] = (
@@ -277,6 +299,18 @@ class Backlash(AbstractArmEffect):
         dq = np.zeros_like(motion.q)
         dq[:, j] = -b * p
         return ((motion.moved(dq).load - motion.load) / b)[..., None]
+
+    def shift(self, c, arm, z, s, dt):
+        """The sensor runs ahead of the link by the gap it has crossed: to the flank that pushes the link.
+
+        How the motor crosses the gap is left out: it is on the other flank as soon as the load, or the link's
+        velocity, has changed sign.
+        """
+        if self.form == "load-driven":
+            p = jnp.tanh(s.load[self.joint] / _FLANK)
+        else:
+            p = smooth_sign(s.qd[self.joint], 0.01)
+        return jnp.zeros_like(s.q).at[self.joint].set(c[0] * p), z
 
 
 _FLANK = 0.2

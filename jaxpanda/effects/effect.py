@@ -12,7 +12,7 @@ Stribeck friction with and without the Coulomb level that the model already hold
 import abc
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -47,6 +47,22 @@ class Shape:
     logarithmic: bool = True
 
 
+class Resistance(eqx.Module):
+    r"""What an effect does to the joints of a simulated arm: the motion takes $r + d \circ \dot q$ more torque.
+
+    `damping` is friction that changes sign with the velocity, divided by it. At rest its slope is too steep for
+    an explicit step; as damping a simulator takes it implicitly, $(M + h\,\mathrm{diag}\,d)\,\dot q^+ = \ldots$,
+    which is stable at any step and neither reverses a joint nor lets it chatter.
+    """
+
+    torque: Float[Array, " dof"]
+    """r [N m]."""
+    damping: Float[Array, " dof"]
+    """d [N m s/rad]."""
+    state: Float[Array, " states"]
+    """Hidden state after the step."""
+
+
 class AbstractEffect(eqx.Module):
     """Physics that a rigid-body model leaves out; the class is one effect, an instance one shape of it."""
 
@@ -58,8 +74,9 @@ class AbstractEffect(eqx.Module):
     confounded_with: ClassVar[tuple[str, ...]] = ()
     repeats: ClassVar[bool] = False
     """Whether it can act several times over at one place."""
-    sensor: ClassVar[bool] = False
-    """Whether it changes what is measured, and not how the arm moves."""
+    acts_on: ClassVar[Literal["plant", "position", "torque"]] = "plant"
+    """What it changes in a simulation under given torque: how the arm moves (`resist`), what the position sensors
+    show (`shift`), or what the torque sensors show (`sensed`)."""
     bound_to_recording: ClassVar[bool] = False
     """Whether it happened at some time in a recording; `placed` says what that means for others."""
 
@@ -115,6 +132,50 @@ class AbstractEffect(eqx.Module):
         """Changes that reproduce the effect in MuJoCo natively, by joint attribute; empty if none can."""
         return {}
 
+    @property
+    def dry_width(self) -> Array | float | None:
+        """Velocity over which its dry friction changes sign [rad/s]; None where it has no dry friction."""
+        return None
+
+    @property
+    def feels_load(self) -> bool:
+        """Whether its torque depends on acceleration or load, which a simulator has to solve for."""
+        return False
+
+    def begin(self, c: Float[Array, " n"], arm: Arm, s: Channels) -> Float[Array, " states"]:
+        """Hidden state of `resist` or `shift` at the first instant."""
+        return jnp.zeros(0)
+
+    def resist(
+        self, c: Float[Array, " n"], arm: Arm, z: Float[Array, " states"], s: Channels, dt: float
+    ) -> Resistance:
+        """What it does to the joints over a step of `dt` [s] of a simulation; `arm` is the nominal one.
+
+        `s.load` is the torque of the nominal rigid arm at this instant's acceleration.
+        """
+        raise NotImplementedError(f"{self.name} acts on the {self.acts_on} sensors")
+
+    def shift(
+        self, c: Float[Array, " n"], arm: Arm, z: Float[Array, " states"], s: Channels, dt: float
+    ) -> tuple[Float[Array, " dof"], Float[Array, " states"]]:
+        """How much more than the links' positions the position sensors show [rad], and the state after the step.
+
+        `s.load` is the torque that the joints transmit.
+        """
+        raise NotImplementedError(f"{self.name} does not act on the position sensors")
+
+    def sensed(
+        self, c: Float[Array, " n"], t: Float[Array, " time"], tau: Float[Array, "time dof"]
+    ) -> Float[Array, "time dof"]:
+        """What the torque sensors show of the torque [N m] over a whole roll-out."""
+        raise NotImplementedError(f"{self.name} does not act on the torque sensors")
+
+    def true(
+        self, c: Float[Array, " n"], t: Float[Array, " time"], tau: Float[Array, "time dof"]
+    ) -> Float[Array, "time dof"]:
+        """The torque behind what the sensors show: the inverse of `sensed`."""
+        raise NotImplementedError(f"{self.name} does not act on the torque sensors")
+
     def to_json(self) -> dict[str, Any]:
         """Class, shape and form, from which `from_json` makes the effect again."""
         fields = {f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self)}
@@ -141,6 +202,10 @@ class AbstractJointEffect(AbstractEffect):
     def columns(self, s: Channels, dt: float) -> Float[Array, "time n"]:
         """Columns over a recording; `dt` is its time step [s]."""
 
+    def _here(self, value: Array, s: Channels) -> Float[Array, " dof"]:
+        """A number of this joint among zeros."""
+        return jnp.zeros_like(s.q).at[self.joint].set(value)
+
 
 class AbstractInstantEffect(AbstractJointEffect):
     """An effect without memory."""
@@ -151,6 +216,37 @@ class AbstractInstantEffect(AbstractJointEffect):
 
     def columns(self, s: Channels, dt: float) -> Float[Array, "time n"]:
         return jax.vmap(self.at)(s)
+
+    def resist(self, c, arm, z, s, dt):
+        return Resistance(self._here(self.at(s) @ c, s), jnp.zeros_like(s.q), z)
+
+
+class AbstractDryFriction(AbstractInstantEffect):
+    r"""Friction of Coulomb's kind: levels times a smoothed sign of the velocity, and a remainder.
+
+    $$\tau_j = \ell(s)^\top c\,\tanh(\dot q_j / v_0) + m(s)^\top c$$
+    """
+
+    v0: eqx.AbstractVar[Float[Array, ""] | float]
+
+    @abc.abstractmethod
+    def levels(self, s: Channels) -> Float[Array, " n"]:
+        """What multiplies the sign of the velocity."""
+
+    def remainder(self, s: Channels) -> Float[Array, " n"]:
+        """What does not jump where the velocity changes sign."""
+        return jnp.zeros(len(self.coefficients))
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        return self.levels(s) * smooth_sign(jnp.asarray(s.qd)[self.joint], self.v0) + self.remainder(s)
+
+    @property
+    def dry_width(self) -> Array | float | None:
+        return self.v0
+
+    def resist(self, c, arm, z, s, dt):
+        damping = self.levels(s) @ c * sign_over_velocity(s.qd[self.joint], self.v0)
+        return Resistance(self._here(self.remainder(s) @ c, s), self._here(damping, s), z)
 
 
 class AbstractMemoryEffect(AbstractJointEffect):
@@ -169,6 +265,13 @@ class AbstractMemoryEffect(AbstractJointEffect):
     def columns(self, s: Channels, dt: float) -> Float[Array, "time n"]:
         first = jax.tree.map(lambda a: a[0], s)
         return jax.lax.scan(lambda z, now: self.step(z, now, dt), self.start(first), s)[1]
+
+    def begin(self, c, arm, s):
+        return self.start(s)
+
+    def resist(self, c, arm, z, s, dt):
+        z, columns = self.step(z, s, dt)
+        return Resistance(self._here(columns @ c, s), jnp.zeros_like(s.q), z)
 
 
 class AbstractArmEffect(AbstractEffect):
@@ -201,3 +304,11 @@ def _joint_columns(effects, channels, dt):
 def smooth_sign(qd: Array, width: Array | float) -> Array:
     r"""$\tanh(\dot q / v_0)$: the sign of a velocity, for simulators and for velocities that carry noise."""
     return jnp.tanh(qd / width)
+
+
+def sign_over_velocity(qd: Array, width: Array | float) -> Array:
+    r"""$\tanh(\dot q / v_0) / \dot q$ [s/rad], whose limit at rest is $1/v_0$; smooth there too."""
+    x = qd / width
+    near = jnp.abs(x) < 1e-3
+    away = jnp.where(near, 1.0, x)
+    return jnp.where(near, 1 - x**2 / 3, jnp.tanh(away) / away) / width

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractInstantEffect, Coefficient, Shape, smooth_sign
+from .effect import AbstractDryFriction, AbstractInstantEffect, Coefficient, Shape, smooth_sign
 from .motion import Channels, Joint
 
 _WIDTH = Shape("v0", "rad/s", 1e-3, 0.3)
@@ -47,7 +47,7 @@ class ViscousFriction(AbstractInstantEffect):
         return {"damping": {int(self.joint): c[0]}}
 
 
-class CoulombFriction(AbstractInstantEffect):
+class CoulombFriction(AbstractDryFriction):
     r"""Friction of constant magnitude, $\tau_j = F_c \tanh(\dot q_j / v_0)$."""
 
     name: ClassVar[str] = "coulomb_friction"
@@ -74,14 +74,14 @@ class CoulombFriction(AbstractInstantEffect):
     def equation(self) -> str:
         return "tau = coulomb * tanh(dq / v0)"
 
-    def at(self, s: Channels) -> Float[Array, " n"]:
-        return smooth_sign(s.qd[self.joint], self.v0)[None]
+    def levels(self, s: Channels) -> Float[Array, " n"]:
+        return jnp.ones(1)
 
     def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
         return {"frictionloss": {int(self.joint): c[0]}}
 
 
-class AsymmetricFriction(AbstractInstantEffect):
+class AsymmetricFriction(AbstractDryFriction):
     r"""Friction that differs between the directions.
 
     $$\tau_j = F_c \tanh(\dot q_j / v_0) + \Delta_c \tanh^2(\dot q_j / v_0)
@@ -134,21 +134,34 @@ class AsymmetricFriction(AbstractInstantEffect):
             }[self.form]
         )
 
-    def at(self, s: Channels) -> Float[Array, " n"]:
-        qd = s.qd[self.joint]
-        sign = smooth_sign(qd, self.v0)
+    def levels(self, s: Channels) -> Float[Array, " n"]:
+        sign = smooth_sign(s.qd[self.joint], self.v0)
+        one, none = jnp.ones_like(sign), jnp.zeros_like(sign)
         return jnp.stack(
             {
-                "whole": [sign, sign**2],
-                "extra": [sign**2],
-                "viscous": [qd, qd * sign],
-                "viscous extra": [qd * sign],
-                "both": [sign, sign**2, qd * sign],
+                "whole": [one, sign],
+                "extra": [sign],
+                "viscous": [none, none],
+                "viscous extra": [none],
+                "both": [one, sign, none],
+            }[self.form]
+        )
+
+    def remainder(self, s: Channels) -> Float[Array, " n"]:
+        qd = s.qd[self.joint]
+        bend, none = qd * smooth_sign(qd, self.v0), jnp.zeros_like(qd)
+        return jnp.stack(
+            {
+                "whole": [none, none],
+                "extra": [none],
+                "viscous": [qd, bend],
+                "viscous extra": [bend],
+                "both": [none, none, bend],
             }[self.form]
         )
 
 
-class StribeckFriction(AbstractInstantEffect):
+class StribeckFriction(AbstractDryFriction):
     r"""Friction that falls with speed near zero velocity.
 
     $$\tau_j = \left(F_c + (F_s - F_c)\,e^{-(|\dot q_j|/v_s)^\delta}\right) \tanh(\dot q_j / v_0)$$
@@ -200,14 +213,19 @@ class StribeckFriction(AbstractInstantEffect):
         law = bump if self.form == "extra" else f"(coulomb + {bump})"
         return f"tau = {law} * tanh(dq / v0)" + (" + damping * dq" if self.form == "viscous" else "")
 
-    def at(self, s: Channels) -> Float[Array, " n"]:
+    def levels(self, s: Channels) -> Float[Array, " n"]:
+        speed = jnp.abs(s.qd[self.joint])
+        bump = jnp.exp(-((speed / self.stribeck_velocity + 1e-12) ** self.exponent))
+        one, none = jnp.ones_like(bump), jnp.zeros_like(bump)
+        return jnp.stack({"whole": [one, bump], "extra": [bump], "viscous": [one, bump, none]}[self.form])
+
+    def remainder(self, s: Channels) -> Float[Array, " n"]:
         qd = s.qd[self.joint]
-        sign = smooth_sign(qd, self.v0)
-        bump = sign * jnp.exp(-((jnp.abs(qd) / self.stribeck_velocity + 1e-12) ** self.exponent))
-        return jnp.stack({"whole": [sign, bump], "extra": [bump], "viscous": [sign, bump, qd]}[self.form])
+        none = jnp.zeros_like(qd)
+        return jnp.stack({"whole": [none, none], "extra": [none], "viscous": [none, none, qd]}[self.form])
 
 
-class LoadDependentFriction(AbstractInstantEffect):
+class LoadDependentFriction(AbstractDryFriction):
     r"""Friction that grows with the transmitted torque.
 
     $$\tau_j = (F_c + \mu\,|\tau_{load}|^p) \tanh(\dot q_j / v_0)$$
@@ -247,13 +265,16 @@ class LoadDependentFriction(AbstractInstantEffect):
         level = "" if self.form == "extra" else "coulomb + "
         return f"tau = ({level}load_coefficient * |tau_load|^exponent) * tanh(dq / v0)"
 
-    def at(self, s: Channels) -> Float[Array, " n"]:
-        sign = smooth_sign(s.qd[self.joint], self.v0)
-        loaded = (jnp.abs(s.load[self.joint]) + 1e-9) ** self.exponent * sign
-        return jnp.stack([loaded] if self.form == "extra" else [loaded, sign])
+    @property
+    def feels_load(self) -> bool:
+        return True
+
+    def levels(self, s: Channels) -> Float[Array, " n"]:
+        loaded = (jnp.abs(s.load[self.joint]) + 1e-9) ** self.exponent
+        return jnp.stack([loaded] if self.form == "extra" else [loaded, jnp.ones_like(loaded)])
 
 
-class FrictionDrift(AbstractInstantEffect):
+class FrictionDrift(AbstractDryFriction):
     r"""Friction that changes slowly over a recording, as when a joint warms up.
 
     $$\tau_j = g(t)\,(a \tanh(\dot q_j / v_0) + b\,\dot q_j) + F_c \tanh(\dot q_j / v_0) + F_v \dot q_j, \qquad
@@ -316,17 +337,29 @@ class FrictionDrift(AbstractInstantEffect):
             }[self.form]
         )
 
-    def at(self, s: Channels) -> Float[Array, " n"]:
-        qd = s.qd[self.joint]
+    def levels(self, s: Channels) -> Float[Array, " n"]:
         g = -jnp.expm1(-s.t / self.time_constant)
-        sign = smooth_sign(qd, self.v0)
+        one, none = jnp.ones_like(g), jnp.zeros_like(g)
         return jnp.stack(
             {
-                "level extra": [g * sign],
-                "level": [g * sign, sign],
-                "slope extra": [g * qd],
-                "slope": [g * qd, qd],
-                "both extra": [g * sign, g * qd],
+                "level extra": [g],
+                "level": [g, one],
+                "slope extra": [none],
+                "slope": [none, none],
+                "both extra": [g, none],
+            }[self.form]
+        )
+
+    def remainder(self, s: Channels) -> Float[Array, " n"]:
+        qd = s.qd[self.joint]
+        slope, none = -jnp.expm1(-s.t / self.time_constant) * qd, jnp.zeros_like(qd)
+        return jnp.stack(
+            {
+                "level extra": [none],
+                "level": [none, none],
+                "slope extra": [slope],
+                "slope": [slope, qd],
+                "both extra": [none, slope],
             }[self.form]
         )
 

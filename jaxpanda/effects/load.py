@@ -5,11 +5,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxpanda_kernels import rnea
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractArmEffect, Coefficient, Shape
+from .effect import AbstractArmEffect, Coefficient, Resistance, Shape
 from .motion import Motion
 
 _MOMENTS = ("first_moment_x", "first_moment_y", "first_moment_z")
@@ -208,6 +210,16 @@ class PayloadChange(AbstractArmEffect):
         columns = motion.regressor[:, :, 10 * self.link : 10 * self.link + 10] @ self._basis[0]
         return columns * window(motion.time, float(self.start), float(self.stop), motion.dt)[:, None, None]
 
+    @property
+    def feels_load(self) -> bool:
+        return True
+
+    def resist(self, c, arm, z, s, dt):
+        phi = jnp.zeros_like(arm.standard).at[self.link].set(self._basis[0] @ c)
+        q, qd, qdd = (jnp.asarray(x) for x in (s.q, s.qd, s.qdd))
+        torque = rnea(arm.chain, phi, q, qd, qdd) * window(s.t, self.start, self.stop, dt)
+        return Resistance(torque, jnp.zeros_like(s.q), z)
+
     def parameters(self, c, covariance) -> list[dict[str, Any]]:
         joint = self.joints[0] + 1
         when = [{"name": "start", "joint": joint, "value": float(self.start), "std": None, "unit": "s"}]
@@ -268,11 +280,9 @@ class GravityDirection(AbstractArmEffect):
         return {"gravity": np.asarray(arm.chain.gravity) + self.gravity_change(c)}
 
 
-def window(
-    time: Float[np.ndarray, " time"], start: float, stop: float, dt: float
-) -> Float[np.ndarray, " time"]:
+def window(time: Any, start: Any, stop: Any, dt: float) -> Any:
     """1 from `start` to `stop`, with edges one time step wide so that it changes smoothly with both."""
-    return np.clip((time - start) / dt + 0.5, 0, 1) * np.clip((stop - time) / dt + 0.5, 0, 1)
+    return ((time - start) / dt + 0.5).clip(0, 1) * ((stop - time) / dt + 0.5).clip(0, 1)
 
 
 EFFECTS = (InertialParameters, Payload, PayloadChange, GravityDirection)

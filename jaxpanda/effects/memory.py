@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractMemoryEffect, Coefficient, Shape, smooth_sign
+from .effect import AbstractMemoryEffect, Coefficient, Resistance, Shape, sign_over_velocity, smooth_sign
 from .motion import Channels, Joint
 
 
@@ -75,9 +75,26 @@ class PreslidingHysteresis(AbstractMemoryEffect):
             z = sign + (z - sign) * jnp.exp(-jnp.abs(moved))
         else:
             z = jnp.clip(z + moved, -1.0, 1.0)
-        sign = smooth_sign(qd, 0.005)[None]
-        extent = self.form.split()[1]
-        return z, {"only": z, "extra": z - sign, "whole": jnp.concatenate([z, sign])}[extent]
+        sign = smooth_sign(qd, _WIDTH)[None]
+        return z, {"only": z, "extra": z - sign, "whole": jnp.concatenate([z, sign])}[self._extent]
+
+    @property
+    def _extent(self) -> str:
+        return self.form.split()[1]
+
+    @property
+    def dry_width(self) -> Array | float | None:
+        return None if self._extent == "only" else _WIDTH
+
+    def resist(self, c, arm, z, s, dt):
+        z = self.step(z, s, dt)[0]
+        level = {"only": jnp.zeros_like(c[0]), "extra": -c[0], "whole": c[-1]}[self._extent]
+        damping = level * sign_over_velocity(s.qd[self.joint], _WIDTH)
+        return Resistance(self._here(c[0] * z[0], s), self._here(damping, s), z)
+
+
+_WIDTH = 0.005
+"""Velocity over which the sign changes that takes off, or adds, a Coulomb level [rad/s]."""
 
 
 EFFECTS = (PreslidingHysteresis,)

@@ -155,22 +155,24 @@ def _inertias(arm, q):
     return jax.vmap(lambda q: jnp.diag(mass_matrix(arm.chain, arm.standard, q)) + arm.armature)(q)
 
 
+def wrench_columns(arm: Arm, q: Float[Array, " dof"]) -> Float[Array, "links dof 6"]:
+    """`Motion.wrench_columns` of one pose."""
+    R, p = link_poses(arm.chain, q)
+    z = R[:, :, 2]
+    turns = ~arm.chain.prismatic
+
+    def at(link):
+        linear = jnp.where(turns[:, None], jnp.cross(z, p[link] - p), z)
+        angular = jnp.where(turns[:, None], z, 0.0)
+        carried = (jnp.arange(q.shape[0]) <= link)[:, None]
+        return -jnp.where(carried, jnp.concatenate([linear, angular], 1), 0.0)
+
+    return jax.vmap(at)(jnp.arange(q.shape[0]))
+
+
 @jax.jit
 def _wrench_columns(arm, q):
-    def one(q):
-        R, p = link_poses(arm.chain, q)
-        z = R[:, :, 2]
-        turns = ~arm.chain.prismatic
-
-        def at(link):
-            linear = jnp.where(turns[:, None], jnp.cross(z, p[link] - p), z)
-            angular = jnp.where(turns[:, None], z, 0.0)
-            carried = (jnp.arange(q.shape[0]) <= link)[:, None]
-            return -jnp.where(carried, jnp.concatenate([linear, angular], 1), 0.0)
-
-        return jax.vmap(at)(jnp.arange(q.shape[0]))
-
-    return jax.vmap(one)(q)
+    return jax.vmap(lambda q: wrench_columns(arm, q))(q)
 
 
 @jax.jit

@@ -1,9 +1,10 @@
 """What the sensors add: offsets, scales, drift, crosstalk, and clocks out of step."""
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -23,7 +24,7 @@ class TorqueOffset(AbstractInstantEffect):
         "joint_spring",
         "inertial_parameters",
     )
-    sensor: ClassVar[bool] = True
+    acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
 
@@ -42,6 +43,12 @@ class TorqueOffset(AbstractInstantEffect):
     def at(self, s: Channels) -> Float[Array, " n"]:
         return jnp.ones_like(s.t)[None]
 
+    def sensed(self, c, t, tau):
+        return tau.at[:, self.joint].add(c[0])
+
+    def true(self, c, t, tau):
+        return tau.at[:, self.joint].add(-c[0])
+
 
 class TorqueGain(AbstractInstantEffect):
     r"""Wrong scale of a torque sensor, $\tau_j = e\,\tau_j^{true}$.
@@ -53,7 +60,7 @@ class TorqueGain(AbstractInstantEffect):
     name: ClassVar[str] = "torque_gain"
     reveals: ClassVar[str] = "a known load at the flange"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "payload", "load_dependent_friction")
-    sensor: ClassVar[bool] = True
+    acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
 
@@ -72,6 +79,12 @@ class TorqueGain(AbstractInstantEffect):
     def at(self, s: Channels) -> Float[Array, " n"]:
         return s.torque[self.joint][None]
 
+    def sensed(self, c, t, tau):
+        return tau.at[:, self.joint].multiply(1 + c[0])
+
+    def true(self, c, t, tau):
+        return tau.at[:, self.joint].divide(1 + c[0])
+
 
 class TorqueDrift(AbstractInstantEffect):
     r"""Bias of a torque sensor that changes over time, $\tau_j = a\,g(t) + b$ with $g = 1 - e^{-t/T}$.
@@ -84,7 +97,7 @@ class TorqueDrift(AbstractInstantEffect):
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0),)
     reveals: ClassVar[str] = "the same poses early and late"
     confounded_with: ClassVar[tuple[str, ...]] = ("payload_change", "friction_drift", "torque_offset")
-    sensor: ClassVar[bool] = True
+    acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
     time_constant: Float[Array, ""] | float
@@ -126,6 +139,16 @@ class TorqueDrift(AbstractInstantEffect):
         g = -jnp.expm1(-phase)
         return jnp.stack([g] if self.form == "extra" else [g, one])
 
+    def sensed(self, c, t, tau):
+        return tau.at[:, self.joint].add(self._bias(c, t))
+
+    def true(self, c, t, tau):
+        return tau.at[:, self.joint].add(-self._bias(c, t))
+
+    def _bias(self, c: Array, t: Array) -> Array:
+        nothing = jnp.zeros((t.shape[0], 1))
+        return jax.vmap(self.at)(Channels(t, nothing, nothing, nothing, nothing, nothing)) @ c
+
 
 class TorqueCrosstalk(AbstractInstantEffect):
     r"""Torque of one joint appearing in another's sensor, $\tau_j = e\,\tau_k$."""
@@ -133,7 +156,7 @@ class TorqueCrosstalk(AbstractInstantEffect):
     name: ClassVar[str] = "torque_crosstalk"
     reveals: ClassVar[str] = "poses in which the two joints' torques differ"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction")
-    sensor: ClassVar[bool] = True
+    acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
     source: Joint
@@ -153,6 +176,12 @@ class TorqueCrosstalk(AbstractInstantEffect):
     def at(self, s: Channels) -> Float[Array, " n"]:
         return s.torque[self.source][None]
 
+    def sensed(self, c, t, tau):
+        return tau.at[:, self.joint].add(c[0] * tau[:, self.source])
+
+    def true(self, c, t, tau):
+        return tau.at[:, self.joint].add(-c[0] * tau[:, self.source])
+
 
 class EncoderOffset(AbstractArmEffect):
     r"""Constant bias of a position sensor, $\tau(q + \Delta q_j) - \tau(q)$.
@@ -164,7 +193,7 @@ class EncoderOffset(AbstractArmEffect):
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "rad", -0.6, 0.6, False),)
     reveals: ClassVar[str] = "the joint at rest over its range; with and without payload"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction", "joint_spring")
-    sensor: ClassVar[bool] = True
+    acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
 
     joint: Joint
     around: float
@@ -191,6 +220,9 @@ class EncoderOffset(AbstractArmEffect):
         dq[:, int(self.joint)] = a
         return ((motion.moved(dq).load - motion.load) / a)[..., None]
 
+    def shift(self, c, arm, z, s, dt):
+        return jnp.zeros_like(s.q).at[self.joint].set(-c[0]), z
+
     def parameters(self, c, covariance):
         return super().parameters(c, covariance)[:1]
 
@@ -209,7 +241,7 @@ class TimeDelay(AbstractArmEffect):
         "presliding_hysteresis",
         "joint_elasticity",
     )
-    sensor: ClassVar[bool] = True
+    acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     dof: int = eqx.field(static=True)
     around: float
@@ -236,9 +268,20 @@ class TimeDelay(AbstractArmEffect):
         shifted = np.stack([np.interp(late, motion.time, torque[:, j]) for j in range(motion.dof)], 1)
         return ((shifted - torque) / d)[..., None]
 
+    def sensed(self, c, t, tau):
+        return _shifted(t, tau, -c[0])
+
+    def true(self, c, t, tau):
+        return _shifted(t, tau, c[0])
+
     def parameters(self, c, covariance):
         std = float(np.sqrt(max(covariance[0, 0], 0.0)))
         return [{"name": "delay", "joint": None, "value": float(c[0]), "std": std, "unit": "s"}]
+
+
+def _shifted(t: Array, x: Float[Array, "time dof"], by: Array) -> Float[Array, "time dof"]:
+    """x(t + by), held at its ends."""
+    return jax.vmap(lambda column: jnp.interp(t + by, t, column), 1, 1)(x)
 
 
 EFFECTS = (

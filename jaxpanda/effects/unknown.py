@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractInstantEffect, Coefficient, smooth_sign
+from .effect import AbstractInstantEffect, Coefficient, Resistance, sign_over_velocity, smooth_sign
 from .motion import Channels, Joint
 
 _WIDTH = 0.01
@@ -70,7 +70,16 @@ class Unknown(AbstractInstantEffect):
     def _odd(self) -> bool:
         return self.form.startswith("friction") or self.form.startswith("odd")
 
-    def at(self, s: Channels) -> Float[Array, " n"]:
+    @property
+    def dry_width(self) -> Array | float | None:
+        return _WIDTH if self._odd and self.form != "odd in dq_k" else None
+
+    @property
+    def feels_load(self) -> bool:
+        return self.form in ("of load", "friction of load", "of ddq")
+
+    def _hats(self, s: Channels) -> Float[Array, " n"]:
+        """Share of each knot."""
         qd = s.qd[self.joint]
         x = {
             "odd in dq": jnp.abs(qd),
@@ -84,10 +93,19 @@ class Unknown(AbstractInstantEffect):
             "odd in dq_k": jnp.abs(s.qd[self.source]),
         }[self.form]
         knots = jnp.asarray(self.knots)
-        hats = jax.vmap(lambda e: jnp.interp(x, knots, e))(jnp.eye(knots.shape[0]))
+        return jax.vmap(lambda e: jnp.interp(x, knots, e))(jnp.eye(knots.shape[0]))
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
         if not self._odd:
-            return hats
-        return hats * smooth_sign(s.qd[self.source] if self.form == "odd in dq_k" else qd, _WIDTH)
+            return self._hats(s)
+        source = self.source if self.form == "odd in dq_k" else self.joint
+        return self._hats(s) * smooth_sign(s.qd[source], _WIDTH)
+
+    def resist(self, c, arm, z, s, dt):
+        if self.dry_width is None:
+            return super().resist(c, arm, z, s, dt)
+        damping = self._hats(s) @ c * sign_over_velocity(s.qd[self.joint], _WIDTH)
+        return Resistance(jnp.zeros_like(s.q), self._here(damping, s), z)
 
     def parameters(self, c, covariance):
         knots = [
