@@ -18,6 +18,7 @@ from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check
 from jaxpanda.diagnosis.noise import autoregression
+from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.friction import StribeckFriction
@@ -145,6 +146,15 @@ def test_what_the_healthy_arm_shows_already_is_not_reported():
         None, [record(0, worn)], reference=[record(1, worn), record(2, worn)], knowledge="unknown"
     )
     assert "torque_offset" not in {f.effect for f in result.findings}
+
+
+@pytest.mark.parametrize("rate", [50.0, 100.0, 400.0, 1000.0])
+def test_recordings_of_any_rate_come_on_two_grids_that_belong_together(rate):
+    """At rates up to that of the coarse grid, ends cut off the one but not the other ended in a traceback."""
+    trace = prepare(record(0, rate=rate), Arm.panda())
+    np.testing.assert_allclose(trace.channels.t[trace.keep], trace.motion.time)
+    np.testing.assert_allclose(trace.down(trace.channels.q), trace.motion.q, atol=2e-3)
+    assert trace.residual.shape == trace.motion.q.shape
 
 
 def test_bad_calls_say_what_would_work():

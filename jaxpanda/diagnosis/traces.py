@@ -67,8 +67,8 @@ class Trace:
 
     def down(self, fine: Float[np.ndarray, "fine ..."]) -> Float[np.ndarray, "time ..."]:
         """From the fine grid to the coarse one, filtered like the torque."""
-        if len(self.keep) == len(fine):
-            return fine
+        if len(self.keep) < 2 or self.keep[1] - self.keep[0] == 1:
+            return fine[self.keep]
         return signals_.zero_phase(fine, self.cutoff, 1 / self.dt)[self.keep]
 
 
@@ -111,7 +111,7 @@ def prepare(
         tau = signals_.zero_phase(rough.tau, cutoff, rate)[keep]
     motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], held)
     load = motion.load
-    if stride > thin:
+    if len(kept) < len(fine):
         load = scipy.interpolate.CubicSpline(motion.time, load)(np.clip(time[fine], *motion.time[[0, -1]]))
     channels = Channels(time[fine], q[fine], qd[fine], qdd[fine], load, load + held_fine)
     weight = _weight(recording.time, time[keep], rate)
