@@ -25,13 +25,10 @@ def hats(x: Float[np.ndarray, " _time"], count: int) -> Float[np.ndarray, "_time
     return np.stack([np.interp(x, knots, e) for e in np.eye(len(knots))], 1)
 
 
-def saturated_residual(
-    traces: Sequence[Trace],
-    residual: Sequence[Float[np.ndarray, "_time dof"]],
-    joint: int,
-    extra: Sequence[Float[np.ndarray, "_time _n"]],
-) -> tuple[list[Float[np.ndarray, " _time"]], int]:
-    """What the saturated model leaves in a joint of each recording, and its degrees of freedom."""
+def saturated_columns(
+    traces: Sequence[Trace], joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]]
+) -> Float[np.ndarray, "_rows _n"]:
+    """Columns of the saturated model in a joint of all recordings, one below the other, zero in their gaps."""
 
     def stacked(part) -> np.ndarray:
         return np.concatenate([np.asarray(part(trace)) for trace in traces])
@@ -49,10 +46,19 @@ def saturated_residual(
     smooth = [rigid, hats(q, 10), speed, hats(load, 5), swings, clock]
     rough = [sign[:, None] * x for x in (speed, hats(q, 4), hats(load, 3), clock[:, ::2])]
     A = np.concatenate([*smooth, *rough, *([np.concatenate(list(extra))] if extra else [])], 1)
-    w = np.concatenate([t.weight for t in traces])
-    U, s, _ = np.linalg.svd(A * w[:, None], full_matrices=False)
+    return A * np.concatenate([t.weight for t in traces])[:, None]
+
+
+def saturated_residual(
+    traces: Sequence[Trace],
+    residual: Sequence[Float[np.ndarray, "_time dof"]],
+    joint: int,
+    extra: Sequence[Float[np.ndarray, "_time _n"]],
+) -> tuple[list[Float[np.ndarray, " _time"]], int]:
+    """What the saturated model leaves in a joint of each recording, and its degrees of freedom."""
+    U, s, _ = np.linalg.svd(saturated_columns(traces, joint, extra), full_matrices=False)
     U = U[:, s > 1e-6 * s[0]]
-    r = np.concatenate([x[:, joint] for x in residual]) * w
+    r = np.concatenate([x[:, joint] for x in residual]) * np.concatenate([t.weight for t in traces])
     left = r - U @ (U.T @ r)
     return np.split(left, np.cumsum([t.motion.samples for t in traces])[:-1]), U.shape[1]
 
