@@ -188,11 +188,11 @@ def unbiased(problem: Problem, terms: Sequence[Term], noise: Noise) -> Noise:
         r = np.concatenate([x[:, j] for x in problem.residual]) * weight
         measured = autocovariances((r - U @ (U.T @ r))[:, None])
         e = rng.normal(size=(len(r) + _SETTLE, _SIMULATED))
-        gamma = None
+        gamma = measured
         for _ in range(_ITERATIONS):
-            a[j], sigma[j] = _yule_walker(measured if gamma is None else gamma)
+            a[j], sigma[j] = _yule_walker(gamma)
             b = np.concatenate([[1.0], -a[j]])
-            x = scipy.signal.lfilter([sigma[j]], b, e, axis=0)[_SETTLE:] * weight[:, None]
+            x = np.asarray(scipy.signal.lfilter([sigma[j]], b, e, axis=0))[_SETTLE:] * weight[:, None]
             gamma = measured + autocovariances(x) - autocovariances(x - U @ (U.T @ x))
         a[j], sigma[j] = _yule_walker(gamma)
         std[j] = np.sqrt(gamma[0])
@@ -313,12 +313,12 @@ def order_spectrum(
     travel = max(float(np.ptp(x)) for x in q)
     speed = float(np.sqrt(np.mean(np.concatenate(qd) ** 2)))
     if travel < 0.1 or speed < 0.02:
-        return (np.zeros(0),) * 3
+        return np.zeros(0), np.zeros(0), np.zeros(0)
     highest = min(400.0, 2 * np.pi * 0.9 * problem.traces[0].cutoff / speed)
     step = np.pi / (2 * travel)
     orders = step * np.arange(np.ceil(max(5.0, 3 * np.pi / travel) / step), highest / step)
     if len(orders) < 8:
-        return (np.zeros(0),) * 3
+        return np.zeros(0), np.zeros(0), np.zeros(0)
     moving = [(np.abs(v) > 0.1 * speed) * t.weight for v, t in zip(qd, problem.traces, strict=True)]
     left = [m * e for m, e in zip(moving, whitened_residual(problem, design, joint), strict=True)]
 
