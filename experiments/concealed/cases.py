@@ -14,7 +14,7 @@ from pathlib import Path
 import effects as catalogue
 import mujoco
 import numpy as np
-from arm import HOME, N, draw_arm, identified, inverse_dynamics, mjcf
+from arm import HOME, N, draw_arm, identified, inverse_dynamics, mjcf, rough
 from motions import FAMILIES, LEAD, STEP, desired
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, filtfilt, lfilter
@@ -369,6 +369,8 @@ class Plan:
     kinds: tuple[type, ...]
     strengths: tuple[str, ...]
     nasty: str = ""  # for a null: narrow, jitter, missing, friction, identified
+    nominal: str = ""  # exact, identified or rough, instead of drawing one of the first two
+    reference: bool = False  # whether recordings of the arm from before come with it
 
 
 def _strength(extra, noise_std, effect, active, step):
@@ -407,6 +409,7 @@ class Case:
         self.family = str(rng.choice(FAMILIES))
         self.records = int(rng.choice([1, 2, 3], p=[0.45, 0.4, 0.15]))
         self._be_nasty(plan.nasty)
+        self.nominal_kind = plan.nominal or self.nominal_kind
         timed = any(kind in (catalogue.Contact, catalogue.PayloadChange) for kind in plan.kinds)
         if timed and self.records == 3:
             self.records = 2
@@ -442,6 +445,8 @@ class Case:
     def _nominal(self):
         if self.nominal_kind == "exact":
             return self.arm
+        if self.nominal_kind == "rough":
+            return rough(self.arm, np.random.default_rng([*self.seed, 2]))
         rng = self.rng
         _, q, v, a = desired(rng, "fourier", 15.0)
         rows = slice(600, None, 50)
@@ -517,9 +522,14 @@ class Case:
         return bool(np.all((strength > 0.6 * wanted) & (strength < 1.6 * wanted)))
 
     def _simulate(self, k):
-        t, q, v, a = self.motions[k] if k < self.records else self.held_motion
+        motion = self.motions[k] if k < self.records else self.held_motion
         effects = [e for e in self.effects if self._present(e, k)]
         effects = [e if e.interval is None or k == self.records - 1 else _throughout(e) for e in effects]
+        return self._follow(motion, self._clock(k), effects)
+
+    def _follow(self, motion, clock, effects):
+        """The arm with these effects in closed loop on a wanted motion."""
+        t, q, v, a = motion
         user = mujoco.MjModel.from_xml_string(mjcf(self.user_arm))
         user.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
         rows = np.unique(np.append(np.arange(0, len(t), 4), len(t) - 1))
@@ -527,9 +537,15 @@ class Case:
         feed = CubicSpline(t[rows], law.inverse(t[rows], q[rows], v[rows], a[rows]))(t)
         stiffness, damping = self._gains(user)
         plant = Plant(self.arm, effects, self.transition)
-        clock = self._clock(k)
         run = plant.run(t + clock, q, v, feed, stiffness, damping)
         return plant, run
+
+    def _from_before(self, rng):
+        """A recording of the arm while nothing was wrong yet, on a motion of its own."""
+        effects, self.effects = self.effects, []
+        run = self._follow(desired(rng, self.family, float(self.seconds[0])), 0.0, [])[1]
+        self.effects = effects
+        return sense(rng, run, [], self.sensors, self.noise_std)
 
     def _gains(self, model):
         """Stiffness and damping that hold at 1 kHz in every pose: for the least inertia a joint shows."""
@@ -585,6 +601,10 @@ class Case:
         for k, (plant, run) in enumerate(self.runs):
             table = sense(rng, run, plant.effects, self.sensors, self.noise_std)
             write_csv(folder / f"train_{k}.csv", *table)
+        for k in range(2 if self.plan.reference else 0):
+            write_csv(
+                folder / f"reference_{k}.csv", *self._from_before(np.random.default_rng([*self.seed, 3, k]))
+            )
         truth = self._truth()
         truth["heldout"] = {
             "rmse_nominal": _digits(prediction_rmse(user, t, q, tau)),

@@ -14,10 +14,14 @@ NASTY = ("", "narrow", "identified", "jitter", "friction", "clean")
 SHARES = {"strong": 0.22, "medium": 0.22, "weak": 0.12, "null": 0.2, "pair": 0.14, "outside": 0.1}
 
 
-def plans(seed, counts):
-    """The plan of every case. Effects come in shuffled order and all before any twice."""
+def plans(seed, counts, kinds=None, nominal="", reference=False):
+    """The plan of every case. Effects come in shuffled order and all before any twice.
+
+    `kinds` names those that single effects are drawn from; `nominal` and `reference` are for every case.
+    """
     rng = np.random.default_rng([seed, 0])
-    singles = {s: _cycle(rng, catalogue.CATALOGUE) for s in ("strong", "medium", "weak")}
+    some = [kind for kind in catalogue.CATALOGUE if kinds is None or kind.name in kinds]
+    singles = {s: _cycle(rng, some) for s in ("strong", "medium", "weak")}
     outside = _cycle(rng, catalogue.OUTSIDE)
     drawn = []
     for strength, kinds in singles.items():
@@ -28,7 +32,7 @@ def plans(seed, counts):
         drawn.append(Plan("pair", _pair(rng), tuple(str(rng.choice(["medium", "strong"])) for _ in range(2))))
     for k in range(counts["outside"]):
         drawn.append(Plan("outside", (next(outside),), (("strong", "medium")[k % 2],)))
-    return drawn
+    return [replace(plan, nominal=nominal, reference=reference) for plan in drawn]
 
 
 def _cycle(rng, kinds):
@@ -78,9 +82,9 @@ def shares(count):
     return counts
 
 
-def make(seed, counts, out, jobs=1):
+def make(seed, counts, out, jobs=1, **options):
     """Write all cases to folders of `out` that do not tell what is in them; returns the folders."""
-    drawn = plans(seed, counts)
+    drawn = plans(seed, counts, **options)
     order = np.random.default_rng([seed, 1]).permutation(len(drawn))
     folders = [Path(out) / f"case_{k:03d}" for k in range(len(drawn))]
     work = [(seed, int(i), drawn[i], str(folder)) for i, folder in zip(order, folders, strict=True)]
@@ -100,11 +104,20 @@ def main(argv=None):
         "--count", type=int, default=100, help="cases in all, in the proportions of the trial"
     )
     parser.add_argument("--counts", type=json.loads, help='instead: {"strong": 24, "null": 12, ...}')
+    parser.add_argument("--kinds", nargs="+", help="names of the effects that single cases are drawn from")
+    parser.add_argument(
+        "--nominal", choices=["exact", "identified", "rough"], default="", help="of every model; else drawn"
+    )
+    parser.add_argument("--reference", action="store_true", help="add two recordings of each arm from before")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=1)
     args = parser.parse_args(argv)
+    unknown = set(args.kinds or ()) - {kind.name for kind in catalogue.CATALOGUE}
+    if unknown:
+        parser.error(f"no such effects: {sorted(unknown)}")
     counts = {name: 0 for name in SHARES} | args.counts if args.counts else shares(args.count)
-    folders = make(args.seed, counts, args.out, args.jobs)
+    options = {"kinds": args.kinds, "nominal": args.nominal, "reference": args.reference}
+    folders = make(args.seed, counts, args.out, args.jobs, **options)
     print(f"{len(folders)} cases in {args.out}: {counts}")
 
 

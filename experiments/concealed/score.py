@@ -77,10 +77,14 @@ def diagnose(job):
     case, out = map(Path, job)
     out.mkdir(parents=True, exist_ok=True)
     recordings = sorted(case.glob("train_*.csv"))
+    arguments = ["diagnose", "--model", case / "model.xml", "--recording", *recordings, "--out", out]
+    if before := sorted(case.glob("reference_*.csv")):
+        arguments += ["--reference", *before]
+    # What a user knows of where the model's numbers are from; nothing is said of exact or identified ones.
+    if json.loads((case / "truth.json").read_text())["nominal"] == "rough":
+        arguments += ["--knowledge", "rough"]
     start = time.perf_counter()
-    status, printed = call(
-        ["diagnose", "--model", case / "model.xml", "--recording", *recordings, "--out", out]
-    )
+    status, printed = call(arguments)
     seconds = time.perf_counter() - start
     if status == 0:
         predicted = ["--recording", case / "heldout_motion.csv", "--out", out / "heldout.csv"]

@@ -10,10 +10,17 @@ from jaxtyping import Float
 
 from ..effects import CATALOGUE
 from .problem import Problem, Term
-from .search import ACCEPT, State, ranked
+from .search import ACCEPT, State, instead, leftover, shares, without
 
-TEMPERATURE = 3.0
-"""By which differences of evidence are divided: models are never quite right, so evidence overstates."""
+TEMPERATURE, RELATIVE_TEMPERATURE = 3.0, 0.0003
+"""By which differences of evidence are divided [nats, share of the evidence]: laws are never quite right, so that
+evidence overstates, the more the stronger the effect."""
+LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05
+"""When a joint is not fully explained: this share of its squared residual beyond noise is left, more than this
+many times the noise's own, in a joint whose residual is at least this share of the largest."""
+DOUBT, CROWD = 6.0, 0.6
+"""How probability falls with the share that is left in a finding's joints, $e^{-6 s}$, and with every effect
+beyond two that the model needed: who needs many laws has not met the right one."""
 _LISTED = 0.01
 """Probability from which a rival is listed."""
 
@@ -56,36 +63,59 @@ class Finding:
 
 def findings(problem: Problem, state: State) -> list[Finding]:
     """The accepted terms as findings, those that explain most first."""
-    order: dict[tuple, list[int]] = {}
-    for i, term in enumerate(state.terms):
-        order.setdefault(_together(term), []).append(i)
     rivals = [_rivals(problem, state, i) for i in range(len(state.terms))]
-    out = [_finding(problem, state, places, rivals) for places in order.values()]
+    groups = together(problem, state.terms)
+    before, after = leftover(state)
+    left = np.clip(after / np.maximum(before, 1e-9), 0, 1) * (after > LEFT_CLEAR)
+    names = {t.effect.name for t in state.terms}
+    doubt = CROWD ** max(0, len(names) - 2) * np.exp(-DOUBT * shares(state) @ left)
+    out = [_finding(problem, state, places, rivals, doubt) for places in groups]
     return sorted(out, key=lambda f: -f.evidence)
 
 
-def _together(term: Term) -> tuple:
-    """What makes terms one finding."""
-    effect = term.effect
-    if effect.bound_to_recording:
-        return effect.name, effect.joints, getattr(effect, "recording", "")
-    return (effect.name,)
+def partly(state: State) -> bool:
+    """Whether structure is left that the terms do not explain."""
+    before, after = leftover(state)
+    main = before > LEFT_MAIN * before.max()
+    return bool(np.any(main & (after > LEFT_CLEAR) & (after > LEFT * before)))
+
+
+def together(problem: Problem, terms: Sequence[Term]) -> list[list[int]]:
+    """Which terms make one finding: those of one effect at several joints, or that happened at once."""
+    out: list[list[int]] = []
+    for i, term in enumerate(terms):
+        for group in out:
+            if any(_same(problem, terms[k], term) for k in group):
+                group.append(i)
+                break
+        else:
+            out.append([i])
+    return out
+
+
+def _same(problem: Problem, a: Term, b: Term) -> bool:
+    if a.effect.name != b.effect.name:
+        return False
+    if not a.effect.bound_to_recording:
+        return True
+    if getattr(a.effect, "recording", "") != getattr(b.effect, "recording", ""):
+        return False
+    return a.effect.joints == b.effect.joints or len(_intervals(problem, [a, b])) == 1
 
 
 def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, float], float]:
     """Evidence of a term, probability of each effect in its place, its own included."""
     term = state.terms[i]
-    others = (*state.terms[:i], *state.terms[i + 1 :])
-    design = problem.design(others, state.noise)
-    evidence = state.design.log_evidence - design.log_evidence
+    evidence = state.design.log_evidence - without(state, i).log_evidence
     by_name: dict[str, float] = {}
-    for proposal in ranked(problem, design, state.noise):
+    for proposal in instead(problem, state, i):
         name = proposal.effect.name
         by_name[name] = max(by_name.get(name, -np.inf), proposal.evidence)
     if term.effect.name == "unknown":  # it has met its margin already
         by_name["unknown"] = max(by_name.get("unknown", -np.inf), evidence)
     names = list(by_name)
-    weights = np.array([by_name[n] for n in names] + [0.5 * ACCEPT]) / TEMPERATURE
+    weights = np.array([by_name[n] for n in names] + [0.5 * ACCEPT])
+    weights = weights / (TEMPERATURE + RELATIVE_TEMPERATURE * max(float(weights.max()), 0.0))
     posterior = np.exp(weights - scipy.special.logsumexp(weights))
     probability = dict(zip(names, posterior.tolist(), strict=False))
     return evidence, probability, probability.get(term.effect.name, 0.0)
@@ -106,10 +136,18 @@ def torque(problem: Problem, state: State, i: int) -> list[Float[np.ndarray, "_t
     return [columns @ c for columns in state.terms[i].columns]
 
 
-def _finding(problem: Problem, state: State, places: Sequence[int], rivals: Sequence) -> Finding:
+def _finding(
+    problem: Problem,
+    state: State,
+    places: Sequence[int],
+    rivals: Sequence,
+    doubt: Float[np.ndarray, " terms"],
+) -> Finding:
     terms = [state.terms[i] for i in places]
     effect = terms[0].effect
     joints = tuple(sorted({j for t in terms for j in t.effect.joints}))
+    if effect.bound_to_recording:  # what happened at once happened at one place
+        joints = terms[int(np.argmax([rivals[i][0] for i in places]))].effect.joints
     parts = [torque(problem, state, i) for i in places]
     together = [np.sum([part[r] for part in parts], 0) for r in range(len(problem.traces))]
     names = [t.name for t, on in zip(problem.traces, problem.active, strict=True) if on]
@@ -129,10 +167,11 @@ def _finding(problem: Problem, state: State, places: Sequence[int], rivals: Sequ
         parameters += term.effect.parameters(c, covariance)
         if term.effect.equation not in equations:
             equations.append(term.effect.equation)
-    own = min(rivals[i][2] for i in places)
-    weakest = min(places, key=lambda i: rivals[i][2])
+    clearest = max(places, key=lambda i: rivals[i][0])
+    sure = 1.0 if effect.name == "unknown" else float(doubt[clearest])
+    own = sure * rivals[clearest][2]
     alternatives = sorted(
-        ((n, p) for n, p in rivals[weakest][1].items() if n != effect.name and p >= _LISTED),
+        ((n, sure * p) for n, p in rivals[clearest][1].items() if n != effect.name and sure * p >= _LISTED),
         key=lambda pair: -pair[1],
     )
     return Finding(

@@ -19,7 +19,7 @@ from ..export import export_mjcf, panda_mjcf, write_parameters
 from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, load
 from . import knowledge as knowledge_
-from .decide import Finding, coefficients, findings
+from .decide import Finding, coefficients, findings, partly
 from .problem import FOLDS, Problem
 from .search import State, search
 from .traces import Trace, prepare
@@ -138,7 +138,7 @@ def diagnose(
     text, warnings = _corrected_xml(source, corrected)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
-        verdict=_verdict([f.effect for f in found]),
+        verdict=_verdict([f.effect for f in found], partly(state)),
         findings=found,
         fit=fit(problem, state),
         corrected=corrected,
@@ -222,11 +222,11 @@ def _rms(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.sqrt(np.mean(stacked**2, 0)) if len(stacked) else np.zeros(stacked.shape[1])
 
 
-def _verdict(names: Sequence[str]) -> str:
+def _verdict(names: Sequence[str], partly: bool) -> str:
     if not names:
         return "consistent"
     if "unknown" not in names:
-        return "explained"
+        return "partly_explained" if partly else "explained"
     return "unexplained" if set(names) == {"unknown"} else "partly_explained"
 
 

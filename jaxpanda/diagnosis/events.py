@@ -1,7 +1,7 @@
 """Scans over what the grids cannot hold: windows in time, and orders of ripple."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import scipy.linalg
@@ -15,7 +15,7 @@ from ..effects.load import PayloadChange
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
 from .problem import Problem
 
-_BIN = 0.1
+BIN = 0.1
 """Resolution of the scan over time [s]."""
 _WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135)
 _EDGE = 3
@@ -39,9 +39,9 @@ class Proposal:
         return self.effect.name, self.effect.joints
 
 
-def ripple(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal]:
-    """For each joint the likeliest order."""
-    for j in range(problem.dof):
+def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]) -> Iterator[Proposal]:
+    """For each of these joints the likeliest order."""
+    for j in joints:
         q = [t.motion.q[:, j] for t in problem.traces]
         travel = max(np.ptp(x) for x in q)
         speed = np.sqrt(np.mean(np.concatenate([t.motion.qd[:, j] for t in problem.traces]) ** 2))
@@ -84,7 +84,7 @@ def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal
     for r, (trace, on) in enumerate(zip(problem.traces, problem.active, strict=True)):
         if not on:
             continue
-        bins = max(2, round(_BIN / trace.motion.dt))
+        bins = max(2, round(BIN / trace.motion.dt))
         edges = np.arange(0, trace.motion.samples, bins)
         clock = trace.motion.time[edges]
         rows = slice(first[r], first[r + 1])
@@ -157,4 +157,4 @@ def _event(effect, b, G, clock, pairs) -> Proposal:
     if isinstance(effect, PayloadChange):
         start, stop = (start, 1e9) if effect.form == "gained" else (-1e9, stop)
     placed = dataclasses.replace(effect, start=start, stop=stop)
-    return Proposal(placed, evidence, float(score[top]), deviation[top] * scale[top], (_BIN, _BIN))
+    return Proposal(placed, evidence, float(score[top]), deviation[top] * scale[top], (BIN, BIN))

@@ -1,8 +1,9 @@
 """Which effects, where, in which shape: greedy selection by evidence, everything refitted at every step."""
 
 import dataclasses
+import itertools
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,10 @@ import scipy.special
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractJointEffect
-from .events import Proposal, ripple, windows
+from ..effects.contact import ExternalContact
+from ..effects.friction import AsymmetricFriction
+from ..effects.load import PayloadChange
+from .events import BIN, Proposal, ripple, windows
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, gram, log_bayes
 from .library import Candidates, columns_of
 from .problem import Problem, Term
@@ -19,9 +23,13 @@ ACCEPT = 25.0
 """Evidence that an effect needs, its search over shapes paid for [nats]."""
 SWAP = 3.0
 """Evidence that another effect must win by to take an accepted one's place [nats]."""
-SHADOW, EVENT_SHADOW = 0.012, 0.06
-"""Share of the strongest term's evidence below which others are taken for its shadows: for what its shape, never
-quite right, leaves over. Events in time, which fit any such leftover somewhere, need a larger share."""
+SHADOW, EVENT_SHADOW = 0.03, 0.1
+"""Share of a stronger term's evidence, in the joints and at the times where a weaker one acts, below which
+the weaker is taken for its shadow: for what the stronger's shape, never quite right, leaves over. Events in
+time, which fit any such leftover somewhere, need a larger share."""
+SECOND_JOINT = 0.03
+"""Share of its torque, squared over noise, that a contact must show beside the joint that feels it most: a
+force on a link turns several joints, while what is left of a joint's own effect stays in that joint."""
 HELD_OUT = 6.0
 """By which a term must lower the squared held-out error, in units of the noise's variance."""
 UNKNOWN_MARGIN, UNKNOWN_SHARE = 10.0, 0.06
@@ -39,10 +47,18 @@ USUAL = {
 }
 """Prior over that of the others [nats]. Laws that hold a simpler one as a special case must earn what they add;
 what moves a link by its load or in time is made of the same noise of q, differentiated twice, as the residual."""
+_RICHER = ("asymmetric_friction", "stribeck_friction", "load_dependent_friction", "friction_drift")
+RICHER_SHARE = 0.001
+"""Share of the evidence that laws which hold Coulomb's as a special case must win by: the real one is neither."""
 MOST_SWAPPED = 6
-MOST_TERMS = 12
+MOST_TERMS, MOST_NAMES = 10, 5
 _REFINED = 7
 _ROUNDS = 4
+_TRIED = 8
+_SETTLED = 4
+_OVERLAP, _FELT = 0.05, 0.02
+_CLOSE = 0.5
+_GIVEN = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,41 +84,156 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
 def search(problem: Problem, log: list[str] | None = None) -> State:
     """Add the likeliest effect while one has evidence; then see if another does better in its place."""
     say = log.append if log is not None else (lambda _: None)
-    state, strongest = start(problem), 0.0
-    while len(state.terms) < MOST_TERMS:
-        proposals = ranked(problem, state.design, state.noise)
+    state, proposals, joints = start(problem), [], None
+    while len(state.terms) < MOST_TERMS and len({t.effect.name for t in state.terms}) < MOST_NAMES:
+        proposals = ranked(problem, state.design, state.noise, joints, proposals)
         say(f"{len(state.terms)} terms: " + describe(proposals[:6]))
         held = {t.key for t in state.terms}
         new = [p for p in proposals if p.key not in held or p.effect.repeats]
-        worthy = [p for p in new if p.evidence >= floor(p.effect, strongest)]
-        if not worthy:
+        worthy = next((p for p in new[:_TRIED] if is_worthy(problem, state, p, say)), None)
+        if worthy is None:
             break
-        state = with_terms(problem, (*state.terms, problem.term(worthy[0].effect, worthy[0].deviation)))
-        strongest = max(strongest, worthy[0].evidence, gain(problem, state, -1))
+        state = with_terms(problem, (*state.terms, problem.term(worthy.effect, worthy.deviation)))
+        state = settle(problem, state)
+        joints = set(np.flatnonzero(shares(state)[-1] > _FELT).tolist())
     state = prune(problem, swap(problem, prune(problem, state, say), say), say)
     return gate(problem, contest(problem, state, say), say)
+
+
+def is_worthy(problem: Problem, state: State, proposal: Proposal, say: Any) -> bool:
+    """Whether a proposal has evidence, and more than the shadow of what is in the model already."""
+    if proposal.evidence < ACCEPT:
+        return False
+    terms = (*state.terms, problem.term(proposal.effect, proposal.deviation))
+    grown = State(terms, state.noise, problem.design(terms, state.noise))
+    least = floors(grown, [*gains(state), proposal.evidence])[-1]
+    if proposal.evidence < least:
+        say(f"{describe([proposal])} is less than {least:.0f}: a shadow")
+    return proposal.evidence >= least
+
+
+def settle(problem: Problem, state: State) -> State:
+    """The newest term refined again in its own noise, then the older ones beside it that act where it does."""
+    share = shares(state)
+    overlapping = [i for i in range(len(share)) if share[i] @ share[-1] > _OVERLAP]
+    for i in overlapping[::-1][:_SETTLED]:
+        term = state.terms[i]
+        if not term.effect.shapes:
+            continue
+        design = without(state, i)
+        best, deviation = _single(problem, design, state.noise, term.effect)
+        steps = tuple(0.5 * x for x in first_steps(term.effect))
+        proposal = Proposal(term.effect, best, best, deviation, steps)
+        better = refine(problem, design, state.noise, proposal)
+        if better.best > best + 1.0:
+            terms = list(state.terms)
+            terms[i] = problem.term(better.effect, better.deviation)
+            state = State(tuple(terms), state.noise, problem.design(terms, state.noise))
+    return state
+
+
+def places(state: State) -> list[slice]:
+    """Where each term's coefficients are among those of the design."""
+    sizes = [len(t.deviation) for t in state.terms]
+    ends = len(state.design.precision) - sum(sizes) + np.cumsum([0, *sizes])
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
+
+
+def without(state: State, i: int) -> Design:
+    """The model less one of its terms."""
+    kept = np.ones(len(state.design.precision), bool)
+    kept[places(state)[i]] = False
+    design = state.design
+    return Design([A[:, kept] for A in design.columns], design.residual, design.precision[kept])
+
+
+def gains(state: State) -> list[float]:
+    """Evidence of each term beside the others [nats]."""
+    return [state.design.log_evidence - without(state, i).log_evidence for i in range(len(state.terms))]
+
+
+def leftover(state: State) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
+    """Mean square of each joint's whitened residual beyond the noise's, before the terms and after them."""
+    design, terms = state.design, places(state)
+    kept = np.arange(len(design.precision)) < (terms[0].start if terms else len(design.precision))
+    bare = Design([A[:, kept] for A in design.columns], design.residual, design.precision[kept])
+    out = []
+    for d in (bare, design):
+        left = [r - A @ d.x for A, r in zip(d.columns, d.residual, strict=True)]
+        out.append(np.array([np.sum(e**2) / max(np.count_nonzero(e), 1) - 1 for e in left]))
+    return out[0], out[1]
+
+
+def energies(state: State) -> Float[np.ndarray, "terms dof rows"]:
+    """Half the square of each term's torque over the noise: about the evidence that each sample could give."""
+    x = state.design.x
+    columns = state.design.columns
+    return np.array([[0.5 * (A[:, at] @ x[at]) ** 2 for A in columns] for at in places(state)]).reshape(
+        len(state.terms), len(columns), len(columns[0])
+    )
+
+
+def shares(state: State) -> Float[np.ndarray, "terms dof"]:
+    """Share of each term's torque, squared over noise, that acts in each joint."""
+    energy = energies(state).sum(2)
+    return energy / np.maximum(energy.sum(1, keepdims=True), 1e-300)
+
+
+def floors(state: State, gained: Sequence[float]) -> list[float]:
+    r"""Evidence that each term needs beside the stronger ones [nats].
+
+    $\max(\text{ACCEPT}, \epsilon \sum_k g_k \sum_j s_{ij} s_{kj})$ with the evidence $g_k$ of each
+    stronger term, the share $s_{ij}$ of the term's torque (squared, over noise) that acts in joint j, and the
+    share $s_{kj}$ of the stronger one's that acts in joint j while the term does. What is strong in one joint
+    casts no shadow on another.
+    """
+    energy = energies(state)
+    total = np.maximum(energy.sum((1, 2)), 1e-300)
+    out = []
+    for i, term in enumerate(state.terms):
+        where = energy[i].sum(1) / total[i]
+        once = term.effect.bound_to_recording
+        rows = energy[i].any(0) if once else slice(None)
+        stronger = [k for k in range(len(total)) if gained[k] > gained[i]]
+        beside = sum(gained[k] * float(where @ energy[k][:, rows].sum(1)) / total[k] for k in stronger)
+        least = max(ACCEPT, (EVENT_SHADOW if once else SHADOW) * beside)
+        if isinstance(term.effect, ExternalContact):
+            beyond = total[i] * (1 - where.max())
+            if beyond < max(SECOND_JOINT * total[i], 0.5 * ACCEPT):
+                least = np.inf
+        out.append(least)
+    return out
 
 
 def gate(problem: Problem, state: State, say: Any) -> State:
     """Drop what does not help where it was not fitted; what happened once cannot be tested so, and stays."""
     while True:
-        reference = problem.held_out_error(state.design)
-        for i in sorted(range(len(state.terms)), key=lambda i: gain(problem, state, i)):
-            if state.terms[i].effect.bound_to_recording:
+        once = [t.effect.bound_to_recording for t in state.terms]
+        energy = energies(state)[once].sum((0, 1)) if any(once) else np.zeros(len(state.design.residual[0]))
+        counts = energy <= 0
+        reference = held_out_error(problem, state.design, counts)
+        for i in np.argsort(gains(state)):
+            if once[i]:
                 continue
-            others = (*state.terms[:i], *state.terms[i + 1 :])
-            helped = problem.held_out_error(problem.design(others, state.noise)) - reference
+            helped = held_out_error(problem, without(state, int(i)), counts) - reference
             if helped < HELD_OUT:
                 say(f"gate {state.terms[i].key}: held-out error falls by {helped:.1f} only")
-                state = with_terms(problem, others)
+                state = with_terms(problem, (*state.terms[:i], *state.terms[i + 1 :]))
                 break
         else:
             return state
 
 
-def floor(effect: AbstractEffect, strongest: float) -> float:
-    """Evidence that an effect needs beside a stronger one [nats]."""
-    return max(ACCEPT, (EVENT_SHADOW if effect.bound_to_recording else SHADOW) * strongest)
+def held_out_error(problem: Problem, design: Design, counts: np.ndarray) -> float:
+    """Squared whitened error on blocks that the coefficients were not fitted to, in the rows that count."""
+    error = 0.0
+    for train, test in problem.folds:
+        fitted = Design(
+            [A[train] for A in design.columns], [r[train] for r in design.residual], design.precision
+        )
+        for A, r in zip(design.columns, design.residual, strict=True):
+            error += float(np.sum((r - A @ fitted.x)[test] ** 2 * counts[test]))
+    return error
 
 
 def contest(problem: Problem, state: State, say: Any) -> State:
@@ -124,38 +255,56 @@ def contest(problem: Problem, state: State, say: Any) -> State:
 
 def swap(problem: Problem, state: State, say: Any) -> State:
     """Take out each term in turn, and put in what then has most evidence."""
-    for i in range(len(state.terms) if 1 < len(state.terms) <= MOST_SWAPPED else 0):
-        others = (*state.terms[:i], *state.terms[i + 1 :])
-        design = problem.design(others, state.noise)
-        proposals = ranked(problem, design, state.noise)
-        held = next((p.evidence for p in proposals if p.key == state.terms[i].key), -np.inf)
+    for i in range(len(state.terms) if len(state.terms) <= MOST_SWAPPED else 0):
+        term = state.terms[i]
+        proposals = instead(problem, state, i)
+        held = next((p.evidence for p in proposals if p.key == term.key), -np.inf)
         best = proposals[0]
-        if best.key == state.terms[i].key or best.evidence > held + SWAP:
-            if best.key != state.terms[i].key:
-                say(f"swap {state.terms[i].key} for " + describe([best]))
+        if best.key == term.key:
+            changed = best.evidence > 1.0 + held_evidence(problem, state, i)
+        else:
+            changed = best.evidence > held + SWAP
+            if changed:
+                say(f"swap {term.key} for " + describe([best]))
+        if changed:
             terms = list(state.terms)
             terms[i] = problem.term(best.effect, best.deviation)
             state = with_terms(problem, terms)
     return state
 
 
+def held_evidence(problem: Problem, state: State, i: int) -> float:
+    """Evidence of a term's own shape in its place [nats]."""
+    return _single(problem, without(state, i), state.noise, state.terms[i].effect)[0]
+
+
+def instead(problem: Problem, state: State, i: int) -> list[Proposal]:
+    """What each effect would bring in a term's place, where the term acts; most evidence first."""
+    others = tuple(t for k, t in enumerate(state.terms) if k != i)
+    key = ("instead", *map(id, others), id(state.terms[i]), id(state.noise))
+    cache = problem._cache
+    if key not in cache:
+        effect = state.terms[i].effect
+        acts = set(effect.joints) if isinstance(effect, AbstractJointEffect) else {
+            int(j) for j in np.flatnonzero(shares(state)[i] > _FELT)
+        }  # fmt: skip
+        scanned = ranked(problem, without(state, i), state.noise, acts)
+        cache[key] = (scanned, state)  # the state is kept, lest its parts' identities be used again
+    held = {t.key for t in others if not t.effect.repeats}
+    return [p for p in cache[key][0] if p.key not in held]
+
+
 def prune(problem: Problem, state: State, say: Any) -> State:
     """Drop terms that the others have made needless, the weakest first."""
     while state.terms:
-        gains = [gain(problem, state, i) for i in range(len(state.terms))]
-        lacking = [g - floor(t.effect, max(gains)) for g, t in zip(gains, state.terms, strict=True)]
+        gained = gains(state)
+        lacking = [g - least for g, least in zip(gained, floors(state, gained), strict=True)]
         weakest = int(np.argmin(lacking))
         if lacking[weakest] >= 0:
             break
-        say(f"prune {state.terms[weakest].key}: {gains[weakest]:.1f}")
+        say(f"prune {state.terms[weakest].key}: {gained[weakest]:.1f}")
         state = with_terms(problem, (*state.terms[:weakest], *state.terms[weakest + 1 :]))
     return state
-
-
-def gain(problem: Problem, state: State, i: int) -> float:
-    """Evidence of a term beside the others [nats]."""
-    others = [t for t in state.terms if t is not state.terms[i]]
-    return state.design.log_evidence - problem.design(others, state.noise).log_evidence
 
 
 def describe(proposals: Sequence[Proposal]) -> str:
@@ -163,27 +312,81 @@ def describe(proposals: Sequence[Proposal]) -> str:
     return "; ".join(f"{p.key[0]}{[j + 1 for j in p.key[1]]} {p.evidence:.1f}" for p in proposals)
 
 
-def ranked(problem: Problem, design: Design, noise: Noise) -> list[Proposal]:
+def ranked(
+    problem: Problem,
+    design: Design,
+    noise: Noise,
+    joints: Collection[int] | None = None,
+    before: Sequence[Proposal] = (),
+) -> list[Proposal]:
     """What each effect at each place would bring, the best of them refined; most evidence first.
 
     A free form must beat the best named effect by a margin, since no named law is quite the real one.
+
+    Args:
+        problem: whose library is tried.
+        design: what is in the model.
+        noise: to weigh by.
+        joints: where effects of single joints are scanned; None for all.
+        before: an earlier scan's, to be taken for other joints; those in front are weighed again.
     """
-    proposals = [
-        *(handicapped(p) for p in grids(problem, design, noise, problem.catchalls)),
-        *grids(problem, design, noise, problem.library),
-        *ripple(problem, design, noise),
-        *windows(problem, design, noise),
+    where = range(problem.dof) if joints is None else sorted(joints)
+    here = [g for g in problem.library if g.joint is None or g.joint in where]
+    free = [g for g in problem.catchalls if g.joint in where]
+    scanned = [
+        *(handicapped(p) for p in grids(problem, design, noise, free)),
+        *grids(problem, design, noise, here),
+        *ripple(problem, design, noise, where),
+        *(windows(problem, design, noise) if len(where) > 1 or joints is None or before else ()),
     ]
-    places = Counter(name for name, _ in {p.key for p in proposals})
-    best: dict[tuple, Proposal] = {}
-    for p in proposals:
-        p = dataclasses.replace(p, evidence=p.evidence - np.log(places[p.key[0]]) + USUAL.get(p.key[0], 0.0))
+    many = _places(problem)
+    best: dict[tuple, Proposal] = {p.key: p for p in before if is_elsewhere(p.effect, where)}
+    for p in scanned:
+        name = p.key[0]
+        usual = USUAL.get(name, 0.0)
+        if name in _RICHER:
+            usual = min(usual, -RICHER_SHARE * p.evidence)
+        p = dataclasses.replace(p, evidence=p.evidence - np.log(many[name]) + usual)
         if p.key not in best or p.evidence > best[p.key].evidence:
             best[p.key] = p
     order = sorted(best.values(), key=lambda p: -p.evidence)
-    close = sum(p.evidence > max(0.4 * order[0].evidence, 4.0) for p in order[:_REFINED])
+    close = sum(p.evidence > max(_CLOSE * order[0].evidence, 4.0) for p in order[:_REFINED])
     refined = [refine(problem, design, noise, p) for p in order[:close]]
+    refined = [p for p in refined if is_dissipative(problem, design, noise, p)]
     return sorted([*refined, *order[close:]], key=lambda p: -p.evidence)
+
+
+def is_dissipative(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
+    """Whether what calls itself friction that depends on the direction takes energy, whatever the direction.
+
+    Its even part may have either sign, but not exceed the odd one, with what the model has of friction: or it is
+    a torque that does not know the direction, and no friction.
+    """
+    effect = proposal.effect
+    if not isinstance(effect, AsymmetricFriction):
+        return True
+    j, term = effect.joints[0], problem.term(effect, proposal.deviation)
+    Phi = problem.whitened([c[:, j : j + 1] for c in term.columns], noise, j)
+    b, G = design.in_joint(j, Phi, gram(Phi))
+    c = np.linalg.solve(G[0] + np.diag(proposal.deviation**-2.0), b[0])
+    power = [
+        (x[:, j] @ c + t.motion.friction[:, j]) * t.motion.qd[:, j]
+        for x, t in zip(term.columns, problem.traces, strict=True)
+    ]
+    power = np.concatenate(power)
+    return bool(-power[power < 0].sum() < _GIVEN * power[power > 0].sum())
+
+
+def is_elsewhere(effect: AbstractEffect, joints: Collection[int]) -> bool:
+    """Whether an effect acts in a single joint that is none of these."""
+    return isinstance(effect, AbstractJointEffect) and effect.joints[0] not in joints
+
+
+def _places(problem: Problem) -> Counter[str]:
+    """At how many places each effect is tried."""
+    keys = {(g.name, g.effects[0].joints) for g in (*problem.library, *problem.catchalls)}
+    events = {(name, (j,)) for name in ("torque_ripple", "external_contact") for j in range(problem.dof)}
+    return Counter(name for name, _ in {*keys, *events, ("payload_change", ())})
 
 
 def handicapped(proposal: Proposal) -> Proposal:
@@ -209,12 +412,19 @@ def grids(problem: Problem, design: Design, noise: Noise, groups: Sequence[Candi
                 float(scipy.special.logsumexp(everything) - np.log(len(everything))),
                 float(score[top]),
                 deviation[top] * scale[top],
-                tuple(
-                    0.3 if s.logarithmic else 0.03 * (s.upper - s.lower) for s in group.effects[top].shapes
-                ),
+                first_steps(group.effects[top]),
             )
         )
     return out
+
+
+def first_steps(effect: AbstractEffect) -> tuple[float, ...]:
+    """Of a refinement: a factor where the shape is logarithmic, a tenth of a second for what happens in time."""
+    ranges = [s.upper - s.lower for s in effect.shapes]
+    return tuple(
+        0.3 if s.logarithmic else 0.03 * r if np.isfinite(r) else BIN
+        for s, r in zip(effect.shapes, ranges, strict=True)
+    )
 
 
 def _scales(coefficients) -> tuple[float, ...]:
@@ -288,7 +498,7 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
         moves = [m * e for e in np.diag(steps) for m in (-1.0, 1.0, -0.4, 0.4)]
         if len(shapes) > 1:
             moves += [np.array([a, b]) * steps[:2] for a in (-1, 1) for b in (-1, 1)]
-        tried = [moved(effect, move) for move in moves]
+        tried = [within(problem, moved(effect, move)) for move in moves]
         values, deviations = score(problem, design, noise, tried)
         top = int(values.argmax())
         if values[top] > best:
@@ -311,6 +521,15 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
 def _single(problem: Problem, design: Design, noise: Noise, effect: AbstractEffect):
     values, deviations = score(problem, design, noise, [effect])
     return float(values[0]), deviations[0]
+
+
+def within(problem: Problem, effect: AbstractEffect) -> AbstractEffect:
+    """A change of payload kept inside its recording: beyond, it is a payload that was there throughout."""
+    if not isinstance(effect, PayloadChange) or effect.form != "gained":
+        return effect
+    time = next(t.motion.time for t in problem.traces if t.name == effect.recording)
+    start = float(np.clip(effect.start, time[0] + 3 * BIN, time[-1] - 3 * BIN))
+    return dataclasses.replace(effect, start=start)
 
 
 def moved(effect: AbstractEffect, move: Float[np.ndarray, " shapes"]) -> AbstractEffect:
