@@ -15,6 +15,7 @@ import pytest
 from jaxpanda import Arm, InputError, Recording
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, predict
+from jaxpanda.diagnosis.decide import called
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check
 from jaxpanda.diagnosis.noise import autoregression
@@ -157,6 +158,22 @@ def test_recordings_of_any_rate_come_on_two_grids_that_belong_together(rate):
     np.testing.assert_allclose(trace.channels.t[trace.keep], trace.motion.time)
     np.testing.assert_allclose(trace.down(trace.channels.q), trace.motion.q, atol=2e-3)
     assert trace.residual.shape == trace.motion.q.shape
+
+
+def test_friction_over_a_hair_s_breadth_is_coulomb_s():
+    assert called(PreslidingHysteresis(2, 0.0008, "dahl whole")) == "coulomb_friction"
+    assert called(PreslidingHysteresis(2, 0.003, "dahl whole")) == "presliding_hysteresis"
+
+
+def test_what_does_not_know_the_direction_is_no_friction():
+    """A torque that rises with the speed, whatever its sign, used to be called friction that is asymmetric."""
+
+    def blind(t, q, qd, qdd):
+        return 0.6 * qd[:, 2] ** 2 / (0.3 + qd[:, 2] ** 2)
+
+    result = diagnose(None, [record(0, at_joint(3, blind)), record(1, at_joint(3, blind))])
+    assert "asymmetric_friction" not in {f.effect for f in result.findings}
+    assert ("unknown", (2,)) in {(f.effect, f.joints) for f in result.findings}
 
 
 def test_bad_calls_say_what_would_work():

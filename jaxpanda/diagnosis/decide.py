@@ -8,7 +8,9 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
-from ..effects import CATALOGUE
+from ..effects import CATALOGUE, AbstractEffect
+from ..effects.friction import CoulombFriction
+from ..effects.memory import PreslidingHysteresis
 from .problem import Problem, Term
 from .search import ACCEPT, State, instead, leftover, shares, without
 
@@ -21,6 +23,9 @@ many times the noise's own, in a joint whose residual is at least this share of 
 DOUBT, CROWD = 6.0, 0.6
 """How probability falls with the share that is left in a finding's joints, $e^{-6 s}$, and with every effect
 beyond two that the model needed: who needs many laws has not met the right one."""
+STICKS = 1.5e-3
+"""Breakaway distance below which friction with memory is Coulomb's that sticks [rad]: a joint at rest holds any
+load up to the level, which a sign of the velocity cannot say."""
 _LISTED = 0.01
 """Probability from which a rival is listed."""
 
@@ -67,7 +72,7 @@ def findings(problem: Problem, state: State) -> list[Finding]:
     groups = together(problem, state.terms)
     before, after = leftover(state)
     left = np.clip(after / np.maximum(before, 1e-9), 0, 1) * (after > LEFT_CLEAR)
-    names = {t.effect.name for t in state.terms}
+    names = {called(t.effect) for t in state.terms}
     doubt = CROWD ** max(0, len(names) - 2) * np.exp(-DOUBT * shares(state) @ left)
     out = [_finding(problem, state, places, rivals, doubt) for places in groups]
     return sorted(out, key=lambda f: -f.evidence)
@@ -78,6 +83,13 @@ def partly(state: State) -> bool:
     before, after = leftover(state)
     main = before > LEFT_MAIN * before.max()
     return bool(np.any(main & (after > LEFT_CLEAR) & (after > LEFT * before)))
+
+
+def called(effect: AbstractEffect) -> str:
+    """The name of what an effect is: friction that builds up over a hair's breadth is Coulomb's, and sticks."""
+    if isinstance(effect, PreslidingHysteresis) and float(effect.breakaway_distance) < STICKS:
+        return CoulombFriction.name
+    return effect.name
 
 
 def together(problem: Problem, terms: Sequence[Term]) -> list[list[int]]:
@@ -94,7 +106,7 @@ def together(problem: Problem, terms: Sequence[Term]) -> list[list[int]]:
 
 
 def _same(problem: Problem, a: Term, b: Term) -> bool:
-    if a.effect.name != b.effect.name:
+    if called(a.effect) != called(b.effect):
         return False
     if not a.effect.bound_to_recording:
         return True
@@ -109,7 +121,7 @@ def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, fl
     evidence = state.design.log_evidence - without(state, i).log_evidence
     by_name: dict[str, float] = {}
     for proposal in instead(problem, state, i):
-        name = proposal.effect.name
+        name = called(proposal.effect)
         by_name[name] = max(by_name.get(name, -np.inf), proposal.evidence)
     if term.effect.name == "unknown":  # it has met its margin already
         by_name["unknown"] = max(by_name.get("unknown", -np.inf), evidence)
@@ -118,7 +130,7 @@ def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, fl
     weights = weights / (TEMPERATURE + RELATIVE_TEMPERATURE * max(float(weights.max()), 0.0))
     posterior = np.exp(weights - scipy.special.logsumexp(weights))
     probability = dict(zip(names, posterior.tolist(), strict=False))
-    return evidence, probability, probability.get(term.effect.name, 0.0)
+    return evidence, probability, probability.get(called(term.effect), 0.0)
 
 
 def coefficients(
@@ -144,7 +156,7 @@ def _finding(
     doubt: Float[np.ndarray, " terms"],
 ) -> Finding:
     terms = [state.terms[i] for i in places]
-    effect = terms[0].effect
+    effect, name = terms[0].effect, called(terms[0].effect)
     joints = tuple(sorted({j for t in terms for j in t.effect.joints}))
     if effect.bound_to_recording:  # what happened at once happened at one place
         joints = terms[int(np.argmax([rivals[i][0] for i in places]))].effect.joints
@@ -168,14 +180,14 @@ def _finding(
         if term.effect.equation not in equations:
             equations.append(term.effect.equation)
     clearest = max(places, key=lambda i: rivals[i][0])
-    sure = 1.0 if effect.name == "unknown" else float(doubt[clearest])
+    sure = 1.0 if name == "unknown" else float(doubt[clearest])
     own = sure * rivals[clearest][2]
     alternatives = sorted(
-        ((n, sure * p) for n, p in rivals[clearest][1].items() if n != effect.name and sure * p >= _LISTED),
+        ((n, sure * p) for n, p in rivals[clearest][1].items() if n != name and sure * p >= _LISTED),
         key=lambda pair: -pair[1],
     )
     return Finding(
-        effect=effect.name,
+        effect=name,
         joints=joints,
         recordings=tuple(names),
         intervals=intervals,
@@ -186,7 +198,7 @@ def _finding(
         rms_torque=rms,
         evidence=float(sum(rivals[i][0] for i in places)),
         summary=_summary(
-            effect.name, joints, rms, intervals, names, alternatives, problem, own, "; ".join(equations)
+            name, joints, rms, intervals, names, alternatives, problem, own, "; ".join(equations)
         ),
         terms=tuple(places),
     )

@@ -109,7 +109,7 @@ def is_worthy(problem: Problem, state: State, proposal: Proposal, say: Any) -> b
     least = floors(grown, [*gains(state), proposal.evidence])[-1]
     if proposal.evidence < least:
         say(f"{describe([proposal])} is less than {least:.0f}: a shadow")
-    return proposal.evidence >= least
+    return bool(proposal.evidence >= least)
 
 
 def settle(problem: Problem, state: State) -> State:
