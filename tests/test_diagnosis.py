@@ -165,17 +165,6 @@ def test_friction_over_a_hair_s_breadth_is_coulomb_s():
     assert called(PreslidingHysteresis(2, 0.003, "dahl whole")) == "presliding_hysteresis"
 
 
-def test_what_does_not_know_the_direction_is_no_friction():
-    """A torque that rises with the speed, whatever its sign, used to be called friction that is asymmetric."""
-
-    def blind(t, q, qd, qdd):
-        return 0.6 * qd[:, 2] ** 2 / (0.3 + qd[:, 2] ** 2)
-
-    result = diagnose(None, [record(0, at_joint(3, blind)), record(1, at_joint(3, blind))])
-    assert "asymmetric_friction" not in {f.effect for f in result.findings}
-    assert ("unknown", (2,)) in {(f.effect, f.joints) for f in result.findings}
-
-
 def test_bad_calls_say_what_would_work():
     with pytest.raises(InputError, match="at least one"):
         diagnose(None, [])
