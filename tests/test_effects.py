@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
+import scipy.interpolate
 from jaxpanda_kernels import rnea
 
 from jaxpanda import Arm
@@ -24,6 +26,7 @@ from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.load import GravityDirection, InertialParameters, Payload, PayloadChange
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TimeDelay
+from jaxpanda.effects.twist import Law, twist_torque
 from jaxpanda.effects.unknown import Unknown
 
 NAMES = {
@@ -194,7 +197,7 @@ def test_an_encoder_offset_of_a_vertical_first_joint_does_not_show(motion):
 
 def test_a_delay_reproduces_the_shifted_torque_where_it_was_linearised(motion):
     d = 0.02
-    shifted = motion.torque + TimeDelay(7, d).over(motion)[..., 0] * d
+    shifted = motion.torque + TimeDelay(7, d, "whole").over(motion)[..., 0] * d
     np.testing.assert_allclose(shifted[2:], motion.torque[:-2], atol=1e-9)
 
 
@@ -232,6 +235,8 @@ def test_torque_sensors_show_what_the_columns_add(arm, motion, channels):
     for effect in shapes(arm):
         if effect.acts_on != "torque":
             continue
+        if effect.name == "time_delay":
+            effect = TimeDelay(effect.dof, effect.around, "whole")
         d = 0.02  # a delay of two samples is where its column is exact
         c = jnp.full(1, -effect.around if effect.name == "time_delay" else d)
         c = jnp.linspace(d, 2 * d, len(effect.coefficients)) if effect.name != "time_delay" else -c
@@ -248,10 +253,10 @@ def test_a_position_sensor_beyond_a_spring_shows_the_motion_that_takes_the_torqu
     K = 4000.0
     for effect, c in (
         (JointElasticity(1, K, 0.2), 1 / K),
-        (Backlash(3, 0.01, "load-driven"), 0.01),
+        (Backlash(3, 0.01, 1e4), 0.01),
         (EncoderOffset(2, 0.05), 0.05),
     ):
-        c = jnp.full(1, c)
+        c = jnp.full(len(effect.coefficients), c)
         s = Channels(motion.time, motion.q, motion.qd, motion.qdd, motion.torque, motion.torque)
         z = effect.begin(c, arm, jax.tree.map(lambda a: jnp.asarray(a[0]), s))
 
@@ -263,3 +268,63 @@ def test_a_position_sensor_beyond_a_spring_shows_the_motion_that_takes_the_torqu
         before = shown.load - motion.load
         middle = slice(60, -60)
         assert np.abs(left[middle]).max() < 0.1 * np.abs(before[middle]).max(), effect
+
+
+def test_the_torque_through_a_twisted_joint_is_that_of_its_spring(arm, motion):
+    """Where the law is stiff the link follows the sensor; else the joint transmits what its spring gives."""
+    K, b = 3000.0, 0.004
+    added = twist_torque(motion, [Law(1, K, 0.5, half_width=b)])[:, :, 0]
+    transmitted = motion.load[:, 1] + added[:, 1]
+    # The spring's own torque, from a second solution of the same equation by scipy.
+    M, g = (scipy.interpolate.CubicSpline(motion.time, x[:, 1]) for x in (motion.inertia, motion.slope))
+    load = scipy.interpolate.CubicSpline(motion.time, motion.load[:, 1])
+    d = 2 * 0.5 * np.sqrt(K * motion.mean_inertia[1])
+
+    def torque(x, v):
+        y = x - np.clip(x, -b, b)
+        return -K * y - d * v * (y != 0)
+
+    def slope(t, z):
+        return z[1], (torque(*z) - load(t) - g(t) * z[0]) / M(t)
+
+    start = [-load(0.0) / K - b * np.sign(load(0.0)), 0.0]
+    found = scipy.integrate.solve_ivp(slope, (0, motion.time[-1]), start, t_eval=motion.time, max_step=1e-3)
+    expected = np.array([torque(*z) for z in found.y.T])
+    inside = slice(30, -30)
+    error = np.abs(transmitted - expected)[inside]
+    assert np.median(error) < 0.01 * np.abs(expected).max()
+    assert np.mean(error**2) < 0.01 * np.mean(added[inside, 1] ** 2) + 0.002 * np.mean(expected**2)
+
+
+def test_backlash_under_a_load_of_one_sign_is_an_encoder_offset_on_stiff_stops(arm, motion):
+    b, j = 0.003, 3
+    still = Motion(arm, motion.time, motion.q, 0.05 * motion.qd, 0.05**2 * motion.qdd, motion.friction)
+    assert still.load[:, j].max() * still.load[:, j].min() > 0
+    offset = (
+        EncoderOffset(j, -b * np.sign(still.load[0, j])).over(still)[..., 0] * -b * np.sign(still.load[0, j])
+    )
+    found = Backlash(j, b, 1e5).over(still).sum(-1) * b
+    np.testing.assert_allclose(found[30:-30], offset[30:-30], atol=0.1 * np.abs(offset).max())
+
+
+def test_a_link_that_leaves_its_stop_transmits_nothing_until_the_other_one(arm, motion):
+    """A load that swings about zero and a gap too wide to cross: torque stays at zero once it got there."""
+    j = 6
+    load = motion.load[:, j]
+    gone = int(np.argmax(load * np.sign(load[0]) < 0))
+    assert 10 < gone < 350
+    transmitted = load + Backlash(j, 0.1, 1e5, form="whole").over(motion).sum(-1)[:, j] * 0.1
+    soon = slice(gone + 5, gone + 12)
+    assert np.abs(transmitted[soon]).max() < 0.1 * np.abs(load[soon]).max()
+
+
+def test_shapes_evaluated_together_are_those_evaluated_alone(arm, motion):
+    for effects in (JointElasticity.grid(arm)[:9], Backlash.grid(arm)[:9]):
+        together = type(effects[0]).over_many(effects, motion)
+        for i in (0, 8):
+            np.testing.assert_allclose(together[:, :, i], effects[i].over(motion), atol=1e-8)
+
+
+def test_a_gear_that_stiffens_twists_less(motion):
+    soft, stiff = (JointElasticity(1, 400.0, 0.3, s).over(motion)[..., 0] for s in (0.0, 1e-3))
+    assert np.sqrt(np.mean(stiff**2)) < 0.9 * np.sqrt(np.mean(soft**2))

@@ -41,9 +41,8 @@ def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndar
             filled = batch + [batch[-1]] * (_BATCH - len(batch))
             parts.append(joint_columns(filled, trace.channels, trace.dt)[: len(batch)])
         return trace.down(np.moveaxis(np.concatenate(parts), 0, 1))
-    return np.stack(
-        [effect.over(trace.motion) for effect in effects if isinstance(effect, AbstractArmEffect)], 2
-    )
+    arm = [e for e in effects if isinstance(e, AbstractArmEffect)]
+    return type(arm[0]).over_many(arm, trace.motion)
 
 
 def form_of(effect: AbstractEffect) -> tuple[str, str]:

@@ -11,8 +11,9 @@ from jaxpanda_kernels import mass_matrix
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape, smooth_sign
+from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape
 from .motion import Channels, Joint, Motion
+from .twist import Law, low_passed, twist_torque
 
 
 class Armature(AbstractInstantEffect):
@@ -152,21 +153,24 @@ class TorqueRipple(AbstractInstantEffect):
 class JointElasticity(AbstractArmEffect):
     r"""Compliance between the position sensor and the link.
 
-    $$\tau(q + \delta) = -K\,\delta, \qquad
-      \delta(\omega) \approx
-      \frac{-\tau(q)(\omega)}{K - \bar M_{jj}\omega^2 + 2 i \zeta \omega \sqrt{K \bar M_{jj}}}$$
+    The link swings on a spring of stiffness K: `jaxpanda.effects.twist` steps its equation of motion. Columns are
+    $K\,(\tau(q + \delta) - \tau(q))$, so that the coefficient is the compliance 1/K where `stiffness` is right.
+    `stiffening` s is that of a flexspline, whose stiffness rises with load: $T = -K\delta\,(1 + s\,(K\delta)^2)$.
 
-    The link swings on its spring, which near its resonance is far from $-\tau/K$; the columns are
-    $K\,(\tau(q + \delta) - \tau(q))$, so that the coefficient is the compliance where `stiffness` is right.
-    $\delta$ is low-passed: its second derivative would otherwise be made of the same noise as the residual.
+    In form "smooth" the torque that twists is low-passed: the link above its resonance would otherwise take the
+    noise of q, differentiated twice, out of the residual that is made of it. Form "whole", without, is tried
+    where there is evidence of the smooth one.
 
     References:
-        Spong, ASME JDSMC 1987; Madsen et al., Math. Probl. Eng. 2020.
+        Spong, ASME JDSMC 1987; Madsen et al., Math. Probl. Eng. 2020; Tuttle, MIT AI-TR 1365, 1992.
     """
 
     name: ClassVar[str] = "joint_elasticity"
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
-    shapes: ClassVar[tuple[Shape, ...]] = (Shape("stiffness", "N·m/rad", 50.0, 1e6),)
+    shapes: ClassVar[tuple[Shape, ...]] = (
+        Shape("stiffness", "N·m/rad", 50.0, 1e6),
+        Shape("damping_ratio", "1", 0.02, 1.5),
+    )
     reveals: ClassVar[str] = (
         "heavy and light load in the same pose; bursts of high frequency; both encoders, if any"
     )
@@ -180,6 +184,8 @@ class JointElasticity(AbstractArmEffect):
     joint: Joint
     stiffness: Float[Array, ""] | float
     damping_ratio: Float[Array, ""] | float
+    stiffening: Float[Array, ""] | float = 0.0
+    form: str = eqx.field(static=True, default="smooth")
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["JointElasticity"]:
@@ -189,6 +195,10 @@ class JointElasticity(AbstractArmEffect):
             for zeta in ((0.1, 0.3) if K < 1000 else (0.2,))
             for j in range(arm.dof)
         ]
+
+    def variants(self, arm: Arm) -> Sequence["JointElasticity"]:
+        changes = [(s, form) for s in (0.0, 1e-4, 4e-4) for form in ("smooth", "whole")]
+        return [dataclasses.replace(self, stiffening=s, form=form) for s, form in changes]
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -200,20 +210,25 @@ class JointElasticity(AbstractArmEffect):
 
     @property
     def equation(self) -> str:
-        return "q_link = q - compliance * tau"
+        more = " * (1 + stiffening * (stiffness * x)^2)" if float(self.stiffening) else ""
+        return f"q_link = q + x, M_jj * ddx + tau(q + x) = -stiffness * x{more} - damping * dx"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
-        j, K, zeta = int(self.joint), float(self.stiffness), float(self.damping_ratio)
-        inertia = max(motion.mean_inertia[j], 1e-6)
-        load = np.concatenate(
-            [motion.load[:, j], motion.load[::-1, j]]
-        )  # mirrored: no step from end to start
-        w = 2 * np.pi * np.fft.rfftfreq(len(load), motion.dt)
-        spring = 1 - w**2 * inertia / K + 2j * zeta * w * np.sqrt(inertia / K)
-        smooth = 1 / (1 + (w / (2 * np.pi * _DEFLECTION_CUTOFF)) ** 4)
-        dq = np.zeros_like(motion.q)
-        dq[:, j] = -np.fft.irfft(np.fft.rfft(load) * smooth / spring, len(load))[: motion.samples] / K
-        return K * (motion.moved(dq).load - motion.load)[..., None]
+        return self.over_many([self], motion)[:, :, 0]
+
+    @classmethod
+    def over_many(cls, effects: Sequence["JointElasticity"], motion: Motion):
+        laws = [
+            Law(
+                int(e.joint),
+                float(e.stiffness),
+                float(e.damping_ratio),
+                stiffening=float(e.stiffening),
+                cutoff=_TWIST_CUTOFF if e.form == "smooth" else np.inf,
+            )
+            for e in effects
+        ]
+        return (twist_torque(motion, laws) * np.array([law.stiffness for law in laws]))[..., None]
 
     def begin(self, c, arm, s):
         inertia = (
@@ -235,24 +250,34 @@ class JointElasticity(AbstractArmEffect):
         return ahead, jnp.stack([load, settling])
 
 
-_DEFLECTION_CUTOFF = 6.0
-"""Low-pass of a joint's deflection [Hz]."""
+_TWIST_CUTOFF = 6.0
+"""Below it a twist is that of the link's own motion; above it, of noise and impacts [Hz]."""
 
 
 class Backlash(AbstractArmEffect):
-    r"""A dead band between motor and link: the link lies on one flank or the other.
+    r"""A dead band between motor and link: the link lies on one stop or the other, or flies between them.
 
-    $$q_{link} = q_j - b\,p, \qquad p = \tanh(\tau_j/\tau_0)
-      \quad\text{or}\quad p \leftarrow \mathrm{clip}(p + \dot q_j\,dt / b, -1, 1)$$
+    The load pushes the link to a stop; when it changes sign the link leaves it, is free for the width of the gap
+    ($M_{jj}\,\ddot q_{link} + \ldots = 0$: no torque is transmitted), and hits the other stop. The equation of
+    motion is that of `jaxpanda.effects.twist`, stops and gear of stiffness `stop_stiffness`. With
+    $\Delta = (\tau(q + \delta) - \tau(q))/b$ the columns are $\Delta$ below 6 Hz and what is above it: the first
+    coefficient is near the half width b, the second less where impacts are not those of the recording.
 
-    Form "load-driven": the load pushes the link to a flank; "friction-driven": the link is dragged along. Columns
-    are $(\tau(q - b p) - \tau(q))/b$, so that the coefficient is b near `half_width`. Where the load never
-    changes sign this is an encoder offset.
+    Forms "smooth" and "whole" are those of an elastic joint. It is for a position sensor on the motor's side. On
+    the link's side the gap does not show in the torque on that side, and motor torque shows it only as the
+    motor's own inertia and friction. Where the load never changes sign this is an encoder offset and an elastic
+    gear; stops softer than a gear's would be one without a gap.
+
+    References:
+        Nordin and Gutman, Automatica 2002.
     """
 
     name: ClassVar[str] = "backlash"
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
-    shapes: ClassVar[tuple[Shape, ...]] = (Shape("half_width", "rad", 1e-4, 0.1),)
+    shapes: ClassVar[tuple[Shape, ...]] = (
+        Shape("half_width", "rad", 2e-4, 0.1),
+        Shape("stop_stiffness", "N·m/rad", 2000.0, 1e5),
+    )
     reveals: ClassVar[str] = "slow motion through poses where the load changes sign"
     confounded_with: ClassVar[tuple[str, ...]] = (
         "encoder_offset",
@@ -262,16 +287,17 @@ class Backlash(AbstractArmEffect):
 
     joint: Joint
     half_width: Float[Array, ""] | float
-    form: str = eqx.field(static=True)
+    stop_stiffness: Float[Array, ""] | float
+    damping_ratio: Float[Array, ""] | float = 0.2
+    form: str = eqx.field(static=True, default="smooth")
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["Backlash"]:
-        return [
-            cls(j, b, form)
-            for form in ("friction-driven", "load-driven")
-            for b in (5e-4, 4e-3, 0.03)
-            for j in range(arm.dof)
-        ]
+        return [cls(j, b, 2500.0) for b in (5e-4, 1.5e-3, 4e-3, 0.012, 0.035) for j in range(arm.dof)]
+
+    def variants(self, arm: Arm) -> Sequence["Backlash"]:
+        changes = [(r, form) for r in (0.1, 0.2, 0.4) for form in ("smooth", "whole")]
+        return [dataclasses.replace(self, damping_ratio=r, form=form) for r, form in changes]
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -279,42 +305,46 @@ class Backlash(AbstractArmEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("lost_motion", "rad", sign=1, scale=0.02),)
+        return tuple(Coefficient(name, "rad", sign=1, scale=0.02) for name in ("lost_motion", "impact"))
 
     @property
     def equation(self) -> str:
-        where = "tanh(tau / 0.2)" if self.form == "load-driven" else "clip(p + dq * dt / half_width, -1, 1)"
-        return f"q_link = q - lost_motion * p, p = {where}"
+        return (
+            "q_link = q + x, M_jj * ddx + tau(q + x) = -stop_stiffness * (x - clip(x, -half_width, half_width))"
+            " - damping * dx"
+        )
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
-        j, b = int(self.joint), float(self.half_width)
-        if self.form == "friction-driven":
-            p = np.empty(motion.samples)
-            state = float(np.tanh(motion.qd[0, j] / 0.01))
-            for i, moved in enumerate(motion.qd[:, j] * motion.dt / b):
-                state = min(1.0, max(-1.0, state + moved))
-                p[i] = state
-        else:
-            p = np.tanh(motion.load[:, j] / _FLANK)
-        dq = np.zeros_like(motion.q)
-        dq[:, j] = -b * p
-        return ((motion.moved(dq).load - motion.load) / b)[..., None]
+        return self.over_many([self], motion)[:, :, 0]
+
+    @classmethod
+    def over_many(cls, effects: Sequence["Backlash"], motion: Motion):
+        laws = [
+            Law(
+                int(e.joint),
+                float(e.stop_stiffness),
+                float(e.damping_ratio),
+                half_width=float(e.half_width),
+                cutoff=_TWIST_CUTOFF if e.form == "smooth" else np.inf,
+            )
+            for e in effects
+        ]
+        whole = twist_torque(motion, laws) / np.array([law.half_width for law in laws])
+        slow = low_passed(whole, _TWIST_CUTOFF, motion.dt)
+        return np.stack([slow, whole - slow], -1)
 
     def shift(self, c, arm, z, s, dt):
-        """The sensor runs ahead of the link by the gap it has crossed: to the flank that pushes the link.
+        """The sensor runs ahead of the link by half the gap and what the stops give, towards where the load pushes.
 
-        How the motor crosses the gap is left out: it is on the other flank as soon as the load, or the link's
-        velocity, has changed sign.
+        How the motor crosses the gap is left out: it is at the other stop as soon as the load has changed sign.
         """
-        if self.form == "load-driven":
-            p = jnp.tanh(s.load[self.joint] / _FLANK)
-        else:
-            p = smooth_sign(s.qd[self.joint], 0.01)
-        return jnp.zeros_like(s.q).at[self.joint].set(c[0] * p), z
+        load = s.load[self.joint]
+        ahead = c[0] * jnp.tanh(load / _FLANK) + load / self.stop_stiffness
+        return jnp.zeros_like(s.q).at[self.joint].set(ahead), z
 
 
 _FLANK = 0.2
-"""Load that brings a link to its flank [N m]."""
+"""Load that brings a simulated link to its stop [N m]."""
 
 
 EFFECTS = (Armature, JointSpring, TorqueRipple, JointElasticity, Backlash)

@@ -281,6 +281,13 @@ class AbstractArmEffect(AbstractEffect):
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         """Columns over a motion."""
 
+    @classmethod
+    def over_many(
+        cls, effects: Sequence["AbstractArmEffect"], motion: Motion
+    ) -> Float[np.ndarray, "time dof effects n"]:
+        """Columns of many shapes of one form; a class overrides it where together is faster."""
+        return np.stack([effect.over(motion) for effect in effects], 2)
+
 
 _BUCKET = 2048
 

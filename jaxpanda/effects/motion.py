@@ -83,6 +83,16 @@ class Motion:
         return self._over(_link_axes, self.q)
 
     @functools.cached_property
+    def inertia(self) -> Float[np.ndarray, "time dof"]:
+        """What each joint turns [kg m²]: the diagonal of the mass matrix."""
+        return self._over(_inertias, self.q)
+
+    @functools.cached_property
+    def slope(self) -> Float[np.ndarray, "time dof"]:
+        """Derivative of each joint's smooth torque by its own position [N m/rad]."""
+        return self._over(_slopes, self.q, self.qd, self.qdd)
+
+    @functools.cached_property
     def mean_inertia(self) -> Float[np.ndarray, " dof"]:
         """What each joint turns, in the mean over some poses of the motion [kg m²]."""
         poses = self.q[:: max(1, self.samples // 16)][:16]
@@ -148,6 +158,17 @@ def _sensitivity(arm, q, qd, qdd, dq, dqd, dqdd):
         return jax.jvp(lambda *s: _smooth(arm, *s), (q, qd, qdd), (dq, dqd, dqdd))[1]
 
     return jax.vmap(one)(q, qd, qdd, dq, dqd, dqdd)
+
+
+@jax.jit
+def _slopes(arm, q, qd, qdd):
+    def one(q, qd, qdd):
+        def along(e):
+            return jax.jvp(lambda q: _smooth(arm, q, qd, qdd), (q,), (e,))[1] @ e
+
+        return jax.vmap(along)(jnp.eye(q.shape[0]))
+
+    return jax.vmap(one)(q, qd, qdd)
 
 
 @jax.jit

@@ -1,5 +1,6 @@
 """What the sensors add: offsets, scales, drift, crosstalk, and clocks out of step."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 from ..arm import Arm
 from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape
 from .motion import Channels, Joint, Motion
+from .twist import low_passed
 
 
 class TorqueOffset(AbstractInstantEffect):
@@ -230,11 +232,15 @@ class EncoderOffset(AbstractArmEffect):
 class TimeDelay(AbstractArmEffect):
     r"""Torque later than motion by d: $\tau_{measured}(t) = \tau(t - d)$.
 
-    Columns are $(\tau(t - d_0) - \tau(t))/d_0$ of the nominal torque, so that the coefficient is d near $d_0$.
+    Torque sensors are filtered, position sensors hardly: d is not negative. Columns are
+    $(\tau(t - d_0) - \tau(t))/d_0$ of the nominal torque, so that the coefficient is d near $d_0$. In form
+    "smooth" the torque of the rigid arm is low-passed: the residual is made of the same noise of q,
+    differentiated twice, and what is shifted by half of its period would cancel it. Form "whole", without, is
+    tried where there is evidence of the smooth one.
     """
 
     name: ClassVar[str] = "time_delay"
-    shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "s", -0.2, 0.2, False),)
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "s", 1e-4, 0.2),)
     reveals: ClassVar[str] = "fast reversals"
     confounded_with: ClassVar[tuple[str, ...]] = (
         "viscous_friction",
@@ -245,10 +251,14 @@ class TimeDelay(AbstractArmEffect):
 
     dof: int = eqx.field(static=True)
     around: float
+    form: str = eqx.field(static=True, default="smooth")
+
+    def variants(self, arm: Arm) -> Sequence["TimeDelay"]:
+        return [dataclasses.replace(self, form="whole")]
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["TimeDelay"]:
-        return [cls(arm.dof, d) for d in (-0.02, -0.005, 0.002, 0.005, 0.01, 0.02, 0.04)]
+        return [cls(arm.dof, d) for d in (0.002, 0.005, 0.01, 0.02, 0.04)]
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -256,15 +266,16 @@ class TimeDelay(AbstractArmEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("delay", "s"),)
+        return (Coefficient("delay", "s", sign=1),)
 
     @property
     def equation(self) -> str:
         return "tau_measured(t) = tau(t - delay)"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
-        d = np.copysign(max(abs(self.around), 1e-4), self.around)
-        torque, late = motion.torque, motion.time - d
+        d = float(self.around)
+        cutoff = _DELAY_CUTOFF if self.form == "smooth" else np.inf
+        torque, late = low_passed(motion.load, cutoff, motion.dt) + motion.friction, motion.time - d
         shifted = np.stack([np.interp(late, motion.time, torque[:, j]) for j in range(motion.dof)], 1)
         return ((shifted - torque) / d)[..., None]
 
@@ -282,6 +293,10 @@ class TimeDelay(AbstractArmEffect):
 def _shifted(t: Array, x: Float[Array, "time dof"], by: Array) -> Float[Array, "time dof"]:
     """x(t + by), held at its ends."""
     return jax.vmap(lambda column: jnp.interp(t + by, t, column), 1, 1)(x)
+
+
+_DELAY_CUTOFF = 6.0
+"""Below it torque is that of the motion; above it, of the noise of q [Hz]."""
 
 
 EFFECTS = (
