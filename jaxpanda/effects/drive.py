@@ -217,7 +217,7 @@ class JointElasticity(AbstractArmEffect):
         return self.over_many([self], motion)[:, :, 0]
 
     @classmethod
-    def over_many(cls, effects: Sequence["JointElasticity"], motion: Motion):
+    def over_many(cls, effects: Sequence[Any], motion: Motion) -> Float[np.ndarray, "time dof effects n"]:
         laws = [
             Law(
                 int(e.joint),
@@ -318,7 +318,7 @@ class Backlash(AbstractArmEffect):
         return self.over_many([self], motion)[:, :, 0]
 
     @classmethod
-    def over_many(cls, effects: Sequence["Backlash"], motion: Motion):
+    def over_many(cls, effects: Sequence[Any], motion: Motion) -> Float[np.ndarray, "time dof effects n"]:
         laws = [
             Law(
                 int(e.joint),
@@ -334,7 +334,7 @@ class Backlash(AbstractArmEffect):
         return np.stack([slow, whole - slow], -1)
 
     def shift(self, c, arm, z, s, dt):
-        """The sensor runs ahead of the link by half the gap and what the stops give, towards where the load pushes.
+        """The sensor runs ahead of the link by half the gap and what the stops give, the way the load pushes.
 
         How the motor crosses the gap is left out: it is at the other stop as soon as the load has changed sign.
         """

@@ -282,9 +282,7 @@ class AbstractArmEffect(AbstractEffect):
         """Columns over a motion."""
 
     @classmethod
-    def over_many(
-        cls, effects: Sequence["AbstractArmEffect"], motion: Motion
-    ) -> Float[np.ndarray, "time dof effects n"]:
+    def over_many(cls, effects: Sequence[Any], motion: Motion) -> Float[np.ndarray, "time dof effects n"]:
         """Columns of many shapes of one form; a class overrides it where together is faster."""
         return np.stack([effect.over(motion) for effect in effects], 2)
 
