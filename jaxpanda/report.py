@@ -24,6 +24,27 @@ class Table:
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
+    shades: Sequence[Sequence[float | None]] | None = None
+    """On a page, how strongly each cell is coloured: 0 to 1, or below 0 for the other colour."""
+
+    def style(self, row: int, column: int) -> str:
+        """CSS of a cell."""
+        shade = None if self.shades is None else self.shades[row][column]
+        if not shade:
+            return ""
+        colour = "20, 110, 180" if shade > 0 else "190, 120, 30"
+        strength = min(abs(shade), 1.0)
+        ink = "; color: #fff" if strength > 0.65 else ""
+        return f"background: rgba({colour}, {0.85 * strength:.2f}){ink}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Listing:
+    """Lines as they stand in a file, each with a kind ("add", "cut", "note" or none); perhaps folded away."""
+
+    lines: Sequence[tuple[str, str]]
+    caption: str = ""
+    folded: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,12 +58,17 @@ class Figure:
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """A heading with sentences, tables and figures."""
+    """A heading with sentences, figures, tables and listings."""
 
     heading: str
     sentences: Sequence[str] = ()
     tables: Sequence[Table] = ()
     figures: Sequence[Figure] = ()
+    listings: Sequence[Listing] = ()
+    tone: str = ""
+    """On a page: "good", "bad" or "unsure" puts the section's first sentence on a banner."""
+    figures_first: bool = False
+    """On a page, figures stand above the tables."""
 
 
 def number(value: float | None, digits: int = 4) -> str:

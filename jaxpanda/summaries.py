@@ -46,7 +46,7 @@ def identification(found: Any) -> Sequence[Section]:
         tables.append(_friction(found.friction, names))
     if found.rmse is not None:
         tables.append(
-            _by_joint(
+            by_joint(
                 "Torque error at each joint [N m]",
                 names,
                 {"fitted": found.rmse, "held out": found.cross_validated_rmse, "noise floor": found.noise},
@@ -171,39 +171,27 @@ def validation(checked: Any) -> Sequence[Section]:
         )
         for one in checked.torque
     ]
-    return [Section("Validation", sentences, [_by_joint("", names, columns)], figures)]
+    return [Section("Validation", sentences, [by_joint("", names, columns)], figures)]
 
 
 def diagnosis(found: Any) -> Sequence[Section]:
-    """Verdict, each finding with its numbers, and the fit before and after."""
+    """Verdict, each finding with its numbers, and the fit before and after; the page has more."""
     document = found.to_json()
     names = found.corrected.arm.joint_names
     fit = document["fit"]
-    sections = [
-        Section(
-            "Verdict",
-            found.lines(),
-            [
-                _by_joint(
-                    "Torque error in the band of the diagnosis [N m]",
-                    names,
-                    {
-                        "before": fit["rmse_before"],
-                        "after": fit["rmse_after"],
-                        "held out, before": fit["held_out_rmse_before"],
-                        "held out, after": fit["held_out_rmse_after"],
-                        "noise floor": fit["noise_floor"],
-                    },
-                )
-            ],
-            [
-                residual_figure(name, time, before, after, names)
-                for name, time, before, after in found.residuals()
-            ],
-        )
-    ]
+    columns = {
+        "before": fit["rmse_before"],
+        "after": fit["rmse_after"],
+        "held out, before": fit["held_out_rmse_before"],
+        "held out, after": fit["held_out_rmse_after"],
+        "noise floor": fit["noise_floor"],
+    }
+    errors = by_joint("Torque error in the band of the diagnosis [N m]", names, columns)
+    sections = [Section("Verdict", found.lines(), [errors])]
     sections += [_finding(i, one, names) for i, one in enumerate(document["findings"])]
     notes = [*document["notes"]]
+    if document["next_experiment"] is not None:
+        notes.append(f"{document['next_experiment']['file']} holds the motion that would decide.")
     return [*sections, Section("Notes", notes)] if notes else sections
 
 
@@ -220,33 +208,12 @@ def _finding(place: int, one: Mapping[str, Any], names: Sequence[str]) -> Sectio
         for p in one["parameters"]
     ]
     tables = [Table(["parameter", "joint", "value", "std", "unit"], rows)] if rows else []
-    tables.append(_by_joint("Torque that it explains, rms [N m]", names, {"rms": one["rms_torque"]}))
+    tables.append(by_joint("Torque that it explains, rms [N m]", names, {"rms": one["rms_torque"]}))
     return Section(f"{place + 1}. {one['effect'].replace('_', ' ')}", sentences, tables)
 
 
-def residual_figure(
-    name: str,
-    time: Float[np.ndarray, " time"],
-    before: Float[np.ndarray, "time dof"],
-    after: Float[np.ndarray, "time dof"],
-    names: Sequence[str],
-) -> Figure:
-    """What the model leaves of the torque, before and after, joint by joint."""
-
-    def draw(canvas: Any) -> None:
-        axes = canvas.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-        thin = max(1, len(time) // 2000)
-        for j, axis in enumerate(axes):
-            axis.plot(time[::thin], before[::thin, j], color="C1", label="your simulation")
-            axis.plot(time[::thin], after[::thin, j], color="C0", label="corrected")
-            axis.set_ylabel(f"{names[j]} [N m]")
-        axes[0].legend(loc="upper right", ncols=2)
-        axes[-1].set_xlabel("time [s]")
-
-    return Figure(draw, f"{name}: what is left of the measured torque", size=(10.0, 1.3 * len(names)))
-
-
-def _by_joint(caption: str, names: Sequence[str], columns: Mapping[str, Any]) -> Table:
+def by_joint(caption: str, names: Sequence[str], columns: Mapping[str, Any]) -> Table:
+    """A row a joint; columns without values are left out."""
     present = {head: values for head, values in columns.items() if values is not None and len(values)}
     rows = [[name, *(number(values[i]) for values in present.values())] for i, name in enumerate(names)]
     return Table(["joint", *present], rows, caption)

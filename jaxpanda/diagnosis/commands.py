@@ -1,16 +1,18 @@
 """The commands `diagnose` and `predict`: between files and files."""
 
 import dataclasses
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import report, summaries
+from .. import report
 from ..errors import InputError
 from ..files import output_folder, write_text
 from ..recordings import load, load_many
+from . import page
 from .diagnosis import Diagnosis, diagnose, predict
 from .knowledge import Knowledge
 
@@ -48,9 +50,21 @@ def diagnose_files(
         raise InputError("--recording: none given; name at least one file or folder")
     with output_folder(out) as folder:
         found = diagnose(model, load_many(recordings), reference=load_many(reference), knowledge=knowledge)
+        named = [*(("recording", p) for p in recordings), *(("reference", p) for p in reference)]
+        sources = tuple(_source(role, path) for role, path in ([("model", model)] if model else []) + named)
+        found = dataclasses.replace(found, sources=sources)
         found.save(folder)
-        report.to_html("jaxpanda: diagnosis", summaries.diagnosis(found), folder / "report.html")
+        report.to_html("jaxpanda: diagnosis", page.sections(found), folder / "report.html")
     return found
+
+
+def _source(role: str, path: Path) -> dict[str, str]:
+    """Name and digest of a file, or of all files of a folder in the order of their names."""
+    parts = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part.read_bytes())
+    return {"role": role, "name": path.name, "sha256": digest.hexdigest()}
 
 
 def predict_files(diagnosis: Path, recording: Path, out: Path) -> Prediction:

@@ -1,7 +1,8 @@
 """`diagnose`: which physics a simulation is missing, by recordings; `predict`: torque, by what it found."""
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,17 @@ from ..export import export_mjcf, panda_mjcf, write_parameters
 from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, load
 from . import knowledge as knowledge_
+from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import Finding, coefficients, findings, partly
+from .localise import Localisation, localise, unbiased
+from .next_motion import NextMotion, next_motion
 from .problem import FOLDS, Problem
 from .search import State, search
 from .traces import Trace, prepare
 
 CORRECTED = "corrected.json"
 """What `predict` reads."""
+NEXT_MOTION = "next_motion.csv"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +62,44 @@ class Diagnosis:
     """What the search tried, in its order."""
     problem: Problem = dataclasses.field(repr=False)
     state: State = dataclasses.field(repr=False)
+    model_xml: str = dataclasses.field(repr=False)
+    """The simulation as it was given."""
+    knowledge: knowledge_.Knowledge
+    spread: Float[np.ndarray, "standard n"] = dataclasses.field(repr=False)
+    """Of the inertial parameters, as `knowledge` has it."""
+    sources: tuple[Mapping[str, str], ...] = ()
+    """Files that went in: role, name and sha256."""
+    replays: tuple[Mapping[str, Any], ...] = ()
+    """How closely both simulations follow recordings, as `jaxpanda.rollout.compare` says it; may be left out."""
+
+    @functools.cached_property
+    def localisation(self) -> tuple[Localisation, Localisation]:
+        """What stands out of noise before anything was added to the model, and after."""
+        noise = unbiased(self.problem, self.state.terms, self.state.noise)
+        after = localise(self.problem, self.problem.design(self.state.terms, noise), noise)
+        if not self.state.terms:
+            return after, after
+        return localise(self.problem, self.problem.design((), noise), noise), after
+
+    @functools.cached_property
+    def heat_map(self) -> HeatMap:
+        """Held-out gain of every effect at every joint."""
+        return heat_map(self.problem, self.state)
+
+    @functools.cached_property
+    def least_shown(self) -> tuple[Least, ...]:
+        """The smallest size of every effect that these recordings would have shown."""
+        return least_shown(self.problem, self.state)
+
+    @functools.cached_property
+    def next_motion(self) -> NextMotion | None:
+        """The motion that would decide between a finding and its rivals; None where none is needed."""
+        return next_motion(self.problem, self.state, self.findings, self.spread, self.knowledge)
+
+    @functools.cached_property
+    def held_out(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """For each recording the errors [N m] of a fit to other blocks, and which samples count."""
+        return held_out(self.problem, self.state)
 
     def to_json(self) -> dict[str, Any]:
         """diagnosis.json."""
@@ -66,6 +109,16 @@ class Diagnosis:
             "findings": [f.to_json() for f in self.findings],
             "fit": self.fit.to_json(),
             "notes": list(self.notes),
+            "localisation": {
+                when: found.to_json()
+                for when, found in zip(("before", "after"), self.localisation, strict=True)
+            },
+            "heat_map": self.heat_map.to_json(),
+            "smallest_shown": [one.to_json() for one in self.least_shown],
+            "next_experiment": None if self.next_motion is None else self.next_motion.to_json(),
+            "replays": [dict(one) for one in self.replays],
+            "knowledge": self.knowledge,
+            "sources": [dict(one) for one in self.sources],
             "log": list(self.log),
         }
 
@@ -86,7 +139,7 @@ class Diagnosis:
         return [sentence, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]
 
     def save(self, folder: str | Path) -> None:
-        """Write diagnosis.json, corrected.xml and corrected.json."""
+        """Write diagnosis.json, corrected.xml and corrected.json; next_motion.csv where one would decide."""
         folder = Path(folder)
         files.write_json(folder / "diagnosis.json", self.to_json())
         files.write_text(folder / "corrected.xml", self.corrected_xml)
@@ -94,6 +147,8 @@ class Diagnosis:
             folder / CORRECTED,
             {**self.corrected.to_json(), "torque_noise": [float(v) for v in self.fit.noise_floor]},
         )
+        if self.next_motion is not None:
+            self.next_motion.save(folder / NEXT_MOTION)
 
 
 def diagnose(
@@ -147,6 +202,9 @@ def diagnose(
         log=tuple(log),
         problem=problem,
         state=state,
+        model_xml=source.text,
+        knowledge=knowledge,
+        spread=spread,
     )
 
 

@@ -1,0 +1,485 @@
+r"""The motion that would tell apart what these recordings cannot.
+
+A finding a and its rival b are fitted to what was recorded. Over a new motion, a would leave
+
+$$\delta^2(a|b) = \min_{\psi_b, c_b, x}\; \|W(\Phi_a c_a - \Phi_b(\psi_b)\,c_b - A x)\|^2$$
+
+that no shape of b, refitted together with the nuisance on old and new data, could imitate: half of it is the
+evidence for a that the motion is expected to bring [nats] (T-optimality, Atkinson and Fedorov 1975). Torque is
+not needed for that, only q(t). Either may be the true one, so both directions count, by their probabilities (Box
+and Hill 1967); of several rivals the one that is told least decides.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.interpolate
+import scipy.ndimage
+from jaxtyping import Float
+
+from .. import files
+from ..arm import Arm
+from ..effects import AbstractEffect, AbstractJointEffect, Channels, Motion
+from .decide import Finding, coefficients
+from .events import Proposal, ripple
+from .evidence import Noise
+from .knowledge import Knowledge, nuisance
+from .library import columns_of
+from .problem import Problem, Term
+from .search import State, grids
+from .traces import Trace, held_sign
+
+WORTH = 0.05
+"""Probability from which a rival is worth an experiment."""
+_RIVALS, _FINALISTS = 3, 2
+_SHAPES = 16
+"""Shapes of a rival that are tried in each of its forms, at most."""
+_DWELL = 0.5
+"""Rests between moves [s]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Told:
+    """One pair of explanations, and how well two motions tell them apart."""
+
+    finding: str
+    rival: str
+    joint: int | None
+    nats: float
+    """Evidence that the recommended motion is expected to bring for whichever is true."""
+    nats_repeated: float
+    """The same of the recorded motion, once more."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {**dataclasses.asdict(self), "joint": None if self.joint is None else self.joint + 1}
+
+
+@dataclasses.dataclass(frozen=True)
+class NextMotion:
+    """A motion to record next."""
+
+    kind: str
+    time: Float[np.ndarray, " time"]
+    q: Float[np.ndarray, "time dof"]
+    qd: Float[np.ndarray, "time dof"]
+    pairs: tuple[Told, ...]
+    tried: tuple[tuple[str, float], ...]
+    """Every motion that was compared, and the evidence for the pair that it tells least, by rivals in the shape
+    that fitted [nats]."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "kind": self.kind,
+            "file": "next_motion.csv",
+            "seconds": float(self.time[-1] - self.time[0]),
+            "pairs": [p.to_json() for p in self.pairs],
+            "tried": [{"kind": kind, "nats": nats} for kind, nats in self.tried],
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write the motion as a canonical CSV without torque."""
+        dof = self.q.shape[1]
+        head = ",".join(["time", *(f"q_{j + 1}" for j in range(dof)), *(f"dq_{j + 1}" for j in range(dof))])
+        rows = np.column_stack([self.time, self.q, self.qd])
+        lines = [",".join(f"{v:.9g}" for v in row) for row in rows.tolist()]
+        files.write_text(Path(path), "\n".join([head, *lines]) + "\n")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shapes:
+    """Shapes of one form of an effect, with their columns on the recordings where those are known."""
+
+    effects: tuple[AbstractEffect, ...]
+    columns: tuple[np.ndarray, ...] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Side:
+    """One explanation of a pair: what it fitted, and every shape it may have, its own first."""
+
+    effect: AbstractEffect
+    c: Float[np.ndarray, " n"]
+    shapes: tuple[_Shapes, ...]
+
+    @property
+    def alone(self) -> "_Side":
+        """In its own shape only."""
+        return dataclasses.replace(self, shapes=self.shapes[:1])
+
+
+@dataclasses.dataclass(frozen=True)
+class _Pair:
+    a: _Side
+    b: _Side
+    others: tuple[Term, ...]
+    share: float
+    """Probability of a, of the two."""
+
+    @property
+    def alone(self) -> "_Pair":
+        return dataclasses.replace(self, a=self.a.alone, b=self.b.alone)
+
+
+def next_motion(
+    problem: Problem,
+    state: State,
+    found: Sequence[Finding],
+    spread: Float[np.ndarray, "standard n"],
+    knowledge: Knowledge,
+) -> NextMotion | None:
+    """The motion that tells best what the findings are confused with; None where nothing is worth it."""
+    pairs = [pair for finding in found for pair in _pairs(problem, state, finding)][:_RIVALS]
+    if not pairs:
+        return None
+    trace = max(problem.traces, key=lambda t: len(t.channels.t))
+    joints = sorted({j for p in pairs for e in (p.a.effect, p.b.effect) for j in e.joints[:1]})
+    kinds, ways = zip(*motions(problem, trace, joints), strict=True)
+    new = _placed(trace, ways, spread, knowledge)
+    quick = _told(problem, new, state.noise, [pair.alone for pair in pairs])
+    best = sorted(range(1, len(new)), key=lambda i: -min(quick[i]))[:_FINALISTS]
+    chosen = [0, *best]
+    told = _told(problem, [new[i] for i in chosen], state.noise, pairs)
+    results = [(kinds[i], ways[i], nats) for i, nats in zip(chosen, told, strict=True)]
+    repeated = results[0][2]
+    kind, q, told = max(results, key=lambda one: min(one[2]))
+    return NextMotion(
+        kind,
+        np.arange(len(q)) * trace.dt,
+        q,
+        np.gradient(q, trace.dt, axis=0),
+        tuple(
+            Told(
+                p.a.effect.name,
+                p.b.effect.name,
+                p.a.effect.joints[0] if len(p.a.effect.joints) == 1 else None,
+                float(t),
+                float(r),
+            )
+            for p, t, r in zip(pairs, told, repeated, strict=True)
+        ),
+        tuple((kind, float(min(t))) for kind, t in zip(kinds, quick, strict=True)),
+    )
+
+
+def _told(
+    problem: Problem, new: Sequence[Problem], noise: Noise, pairs: Sequence[_Pair]
+) -> list[list[float]]:
+    """For each motion and pair, the evidence that the motion is expected to bring [nats]."""
+    old = [_pair_sums(problem, noise, pair) for pair in pairs]
+    known = [_discrimination(pair, sums) for pair, sums in zip(pairs, old, strict=True)]
+    out = []
+    for one in new:
+        row = []
+        for pair, before, already in zip(pairs, old, known, strict=True):
+            more = _pair_sums(one, noise, pair)
+            together = [_added(x, y) for x, y in zip(before, more, strict=True)]
+            row.append(_discrimination(pair, together) - already)
+        out.append(row)
+    return out
+
+
+def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
+    """The finding against each rival that is worth an experiment."""
+    rivals = {name: p for name, p in finding.alternatives if p >= WORTH}
+    i = max(finding.terms, key=lambda i: float(np.sum(state.terms[i].columns[0] ** 2)))
+    term = state.terms[i]
+    if not rivals or term.effect.bound_to_recording:
+        return []
+    others = (*state.terms[:i], *state.terms[i + 1 :])
+    design = problem.design(others, state.noise)
+    groups = [g for g in (*problem.library, *problem.catchalls) if g.name in rivals]
+    proposals = [*grids(problem, design, state.noise, groups)]
+    if "torque_ripple" in rivals:
+        proposals += ripple(problem, design, state.noise)
+    best: dict[str, Proposal] = {}
+    for p in proposals:
+        name = p.effect.name
+        if name in rivals and (name not in best or p.evidence > best[name].evidence):
+            best[name] = p
+    a = _Side(term.effect, coefficients(problem, state, i)[0], _shapes(problem, term.effect))
+    out = []
+    for name, p in best.items():
+        more = problem.design((*others, problem.term(p.effect, p.deviation)), state.noise)
+        b = _Side(p.effect, more.x[-len(p.deviation) :], _shapes(problem, p.effect))
+        share = finding.confidence / max(finding.confidence + rivals[name], 1e-9)
+        out.append(_Pair(a, b, others, float(np.clip(share, 0.05, 0.95))))
+    return out
+
+
+def _shapes(problem: Problem, effect: AbstractEffect) -> tuple[_Shapes, ...]:
+    """The shapes that an effect may have at its place, those of one form together; its own first."""
+    out = [_Shapes((effect,))]
+    for group in (*problem.library, *problem.catchalls):
+        if group.name == effect.name and group.effects[0].joints == effect.joints:
+            some = slice(None, None, -(-len(group.effects) // _SHAPES))
+            out.append(_Shapes(group.effects[some], tuple(c[..., some, :] for c in group.columns)))
+    return tuple(out)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sums:
+    """Sums over samples, which add up over recordings: of y, of the columns A, and of each shape's columns."""
+
+    H: np.ndarray
+    g: np.ndarray
+    s: float
+    C: tuple[np.ndarray, ...]
+    u: tuple[np.ndarray, ...]
+    G: tuple[np.ndarray, ...]
+
+
+def _added(x: _Sums, y: _Sums) -> _Sums:
+    def both(a, b):
+        return tuple(p + q for p, q in zip(a, b, strict=True))
+
+    return _Sums(x.H + y.H, x.g + y.g, x.s + y.s, both(x.C, y.C), both(x.u, y.u), both(x.G, y.G))
+
+
+def _pair_sums(problem: Problem, noise: Noise, pair: _Pair) -> tuple[_Sums, _Sums]:
+    """What a leaves for b to imitate, and the other way round."""
+    base = []
+    for r, columns in enumerate(problem.nuisance):
+        held = [_wide(problem, _Shapes((t.effect,)), r)[:, :, 0] for t in pair.others]
+        base.append(np.concatenate([columns, *held], 2))
+    A = [problem.whitened([c[:, j] for c in base], noise, j) for j in range(problem.dof)]
+    H = sum(a.T @ a for a in A)
+    return _sums(problem, noise, A, H, pair.a, pair.b), _sums(problem, noise, A, H, pair.b, pair.a)
+
+
+def _sums(problem: Problem, noise: Noise, A: list[np.ndarray], H: Any, true: _Side, rival: _Side) -> _Sums:
+    y = [_wide(problem, true.shapes[0], r)[:, :, 0] @ true.c for r in range(len(problem.traces))]
+    y = [problem.whitened([x[:, j] for x in y], noise, j) for j in range(problem.dof)]
+    g = sum(a.T @ x for a, x in zip(A, y, strict=True))
+    C, u, G = [], [], []
+    for shapes in rival.shapes:
+        wide = [_wide(problem, shapes, r) for r in range(len(problem.traces))]
+        m, k = wide[0].shape[2:]
+        parts = np.zeros((H.shape[0], m * k)), np.zeros(m * k), np.zeros((m, k, k))
+        for j in range(problem.dof):
+            if not any(np.any(w[:, j]) for w in wide):
+                continue
+            F = problem.whitened([w[:, j] for w in wide], noise, j)
+            flat = F.reshape(len(F), -1)
+            parts[0][:] += A[j].T @ flat
+            parts[1][:] += flat.T @ y[j]
+            stacked = np.moveaxis(F, 1, 0)
+            parts[2][:] += np.swapaxes(stacked, 1, 2) @ stacked
+        C.append(parts[0])
+        u.append(parts[1])
+        G.append(parts[2])
+    return _Sums(H, g, float(sum(x @ x for x in y)), tuple(C), tuple(u), tuple(G))
+
+
+def _wide(problem: Problem, shapes: _Shapes, r: int) -> Float[np.ndarray, "_time dof m n"]:
+    """Columns of shapes of one form at all joints of a recording; zero where they are bound to another."""
+    trace, effect = problem.traces[r], shapes.effects[0]
+    out = np.zeros((trace.motion.samples, problem.dof, len(shapes.effects), len(effect.coefficients)))
+    if not problem.active[r] or effect.bound_to_recording:
+        return out
+    known = None if trace.tau is None else shapes.columns
+    columns = columns_of(shapes.effects, trace) if known is None else known[r]
+    if isinstance(effect, AbstractJointEffect):
+        out[:, effect.joints[0]] = columns
+        return out
+    return columns
+
+
+def _discrimination(pair: _Pair, sums: Sequence[_Sums]) -> float:
+    """Expected evidence for whichever of a pair is true [nats]."""
+    a, b = (_left(one, pair) for one in sums)
+    return 0.5 * (pair.share * a + (1 - pair.share) * b)
+
+
+def _left(sums: _Sums, pair: _Pair) -> float:
+    """$\\delta^2$: what no shape of the rival imitates."""
+    precision = np.ones(len(sums.g))
+    if pair.others:
+        own = np.concatenate([t.deviation**-2.0 for t in pair.others])
+        precision[len(precision) - len(own) :] = own
+    H = sums.H + np.diag(precision)
+    x = np.linalg.solve(H, sums.g)
+    best = sums.s - sums.g @ x
+    left = best
+    for C, u, G in zip(sums.C, sums.u, sums.G, strict=True):
+        m, k, _ = G.shape
+        b = (u - C.T @ x).reshape(m, k)
+        C = C.reshape(-1, m, k)
+        S = G - np.einsum("amk,aml->mkl", C, np.linalg.solve(H, C.reshape(len(H), -1)).reshape(C.shape))
+        S = S + 1e-9 * (np.trace(G, axis1=1, axis2=2)[:, None, None] / k + 1e-12) * np.eye(k)
+        gained = np.einsum("mk,mk->m", b, np.linalg.solve(S, b[:, :, None])[:, :, 0])
+        left = min(left, float(best - gained.max()))
+    return max(left, 0.0)
+
+
+def _placed(
+    trace: Trace,
+    ways: Sequence[Float[np.ndarray, "time dof"]],
+    spread: Float[np.ndarray, "standard n"],
+    knowledge: Knowledge,
+) -> list[Problem]:
+    """Motions on the grids of a recording, each as a problem of its own, without torque."""
+    arm, dt = trace.motion.arm, trace.dt
+    stride = int(trace.keep[1] - trace.keep[0])
+    speeds = [np.gradient(q, dt, axis=0) for q in ways]
+    bends = [np.gradient(qd, dt, axis=0) for qd in speeds]
+    signs = held_sign(arm, np.concatenate(speeds), np.concatenate(bends), np.full(arm.dof, 1e-4))
+    out = []
+    for q, qd, qdd, sign in zip(ways, speeds, bends, np.split(signs, len(ways)), strict=True):
+        time, keep = np.arange(len(q)) * dt, np.arange(0, len(q), stride)
+        friction = np.asarray(arm.damping) * qd + np.asarray(arm.frictionloss) * sign
+        motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], friction[keep])
+        load = scipy.interpolate.CubicSpline(motion.time, motion.load)(np.minimum(time, motion.time[-1]))
+        channels = Channels(time, q, qd, qdd, load, load + friction)
+        weight = np.ones(len(keep))
+        new = Trace("next", trace.signals, channels, dt, motion, None, weight, keep, trace.cutoff, sign)
+        out.append(Problem((new,), (True,), tuple(nuisance([new], spread, knowledge))))
+    return out
+
+
+def motions(
+    problem: Problem, trace: Trace, joints: Sequence[int]
+) -> list[tuple[str, Float[np.ndarray, "time dof"]]]:
+    """Candidate motions as long as a recording, on its fine grid, from rest to rest; first the recorded one.
+
+    They stay within nine tenths of the joints' limits and near the box that was recorded, and are little faster.
+    `joints` are those that the pairs are about.
+    """
+    box = _Box.around(problem)
+    n, dt = len(trace.channels.t), trace.dt
+    out = [("the recorded motion again", np.asarray(trace.channels.q))]
+    for seed in range(2):
+        out.append(("a sum of harmonics", box.fourier(n, dt, seed, 1.0)))
+    out.append(("a slow sum of harmonics", box.fourier(n, dt, 2, 0.35)))
+    for seed in range(2):
+        out.append(("moves from pose to pose with rests between", box.points(n, dt, 10 + seed, 1.0)))
+    out.append(("slow moves from pose to pose with rests between", box.points(n, dt, 12, 0.3)))
+    for j in joints[:2]:
+        name = f"joint {j + 1}"
+        out.append((f"{name} back and forth over its range at several speeds", box.sweeps(n, dt, [j], 20)))
+        out.append((f"small reversals of {name} in several poses", box.reversals(n, dt, [j], 21)))
+    out.append(("all joints back and forth at several speeds", box.sweeps(n, dt, range(problem.dof), 22)))
+    return [(kind, box.held(q)) for kind, q in out]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Box:
+    """Where, how fast and with what acceleration motions may go."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+    speed: np.ndarray
+    acceleration: np.ndarray
+
+    @classmethod
+    def around(cls, problem: Problem) -> "_Box":
+        arm: Arm = problem.traces[0].motion.arm
+        every = [t.motion for t in problem.traces]
+        q = np.concatenate([m.q for m in every])
+        least, most = q.min(0), q.max(0)
+        more = 0.25 * np.maximum(most - least, 0.6)
+        lower, upper = np.asarray(arm.lower), np.asarray(arm.upper)
+        room = 0.05 * np.where(np.isfinite(upper - lower), upper - lower, 0.0)
+        return cls(
+            np.minimum(np.maximum(least - more, lower + room), least),
+            np.maximum(np.minimum(most + more, upper - room), most),
+            np.maximum(1.1 * np.abs(np.concatenate([m.qd for m in every])).max(0), 0.3),
+            np.maximum(1.1 * np.abs(np.concatenate([m.qdd for m in every])).max(0), 1.0),
+        )
+
+    def held(self, q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, "time dof"]:
+        return np.clip(q, self.lower, self.upper)
+
+    def pose(self, rng: np.random.Generator) -> np.ndarray:
+        return self.lower + rng.uniform(0.05, 0.95, len(self.lower)) * (self.upper - self.lower)
+
+    def fourier(self, n: int, dt: float, seed: int, share: float) -> np.ndarray:
+        """Five harmonics within the box, from rest to rest."""
+        rng, t = np.random.default_rng(seed), np.arange(n) * dt
+        ramp = np.clip(np.minimum(t, t[-1] - t) / 1.0, 0, 1)
+        clock = np.cumsum(ramp**2 * (3 - 2 * ramp)) * dt
+        w = 2 * np.pi * np.arange(1, 6) / max(0.6 * t[-1], 5.0)
+        a = rng.normal(size=(5, len(self.lower))) / np.arange(1, 6)[:, None]
+        phase = rng.uniform(0, 2 * np.pi, (5, len(self.lower)))
+        q = np.sum(a * np.sin(w[:, None] * clock[:, None, None] + phase), 1)
+        middle = 0.5 * (q.max(0) + q.min(0))
+        qd = np.gradient(q, dt, axis=0)
+        fastest, hardest = np.abs(qd).max(0), np.abs(np.gradient(qd, dt, axis=0)).max(0)
+        room = 0.5 * (self.upper - self.lower) / (0.5 * np.ptp(q, axis=0))
+        scale = np.min([room, share * self.speed / fastest, share * self.acceleration / hardest], 0)
+        free = 0.5 * (self.upper - self.lower) - 0.5 * scale * np.ptp(q, axis=0)
+        centre = 0.5 * (self.upper + self.lower) + rng.uniform(-0.5, 0.5, len(self.lower)) * free
+        return centre + scale * (q - middle)
+
+    def points(self, n: int, dt: float, seed: int, share: float) -> np.ndarray:
+        """Quintic moves between random poses, and rests."""
+        rng = np.random.default_rng(seed)
+        at = self.pose(rng)
+        parts, rows = [np.repeat(at[None], round(_DWELL / dt), 0)], 0
+        while rows < n:
+            to = self.pose(rng)
+            parts += [self._move(at, to, dt, share), np.repeat(to[None], round(_DWELL / dt), 0)]
+            at, rows = to, sum(map(len, parts))
+        return _cut(np.concatenate(parts), n, dt)
+
+    def sweeps(self, n: int, dt: float, joints: Sequence[int], seed: int) -> np.ndarray:
+        """Some joints to and fro at constant speeds, the others in one pose after another."""
+        rng = np.random.default_rng(seed)
+        at, parts, rows, turn = self.pose(rng), [], 0, 0
+        while rows < n:
+            to = self.pose(rng) if turn % 4 == 0 else at.copy()
+            parts.append(self._move(at, to, dt, 0.8))
+            at, share = to, (1.0, 0.15, 0.5, 0.05)[turn % 4]
+            for goal in (self.lower, self.upper):
+                to = at.copy()
+                to[list(joints)] = (0.9 * goal + 0.1 * at)[list(joints)]
+                parts.append(self._steady(at, to, dt, share, longest=4.0))
+                parts.append(np.repeat(parts[-1][-1:], round(0.3 / dt), 0))
+                at = parts[-1][-1]
+            turn, rows = turn + 1, sum(map(len, parts))
+        return _cut(np.concatenate(parts), n, dt)
+
+    def reversals(self, n: int, dt: float, joints: Sequence[int], seed: int) -> np.ndarray:
+        """In several poses, swings of decreasing size."""
+        rng = np.random.default_rng(seed)
+        at, parts, rows = self.pose(rng), [], 0
+        chosen = np.zeros(len(self.lower))
+        chosen[list(joints)] = 1.0
+        while rows < n:
+            to = self.pose(rng)
+            parts.append(self._move(at, to, dt, 0.8))
+            for size in (0.15, 0.04, 0.012):
+                period = float(np.clip(2 * np.pi * size / (0.15 * self.speed[list(joints)].min()), 0.6, 1.6))
+                t = np.arange(round(2 * period / dt)) * dt
+                swing = size * np.sin(2 * np.pi * t / period) * np.sin(np.pi * t / t[-1])
+                parts.append(to + chosen * swing[:, None])
+            at, rows = to, sum(map(len, parts))
+        return _cut(np.concatenate(parts), n, dt)
+
+    def _move(self, at: np.ndarray, to: np.ndarray, dt: float, share: float) -> np.ndarray:
+        """Quintic, as fast as allowed."""
+        way = np.abs(to - at)
+        slow = 15 / 8 * way / (share * self.speed)
+        hard = np.sqrt(5.7735 * way / (share * self.acceleration))
+        s = np.linspace(0, 1, max(round(max(slow.max(), hard.max(), 0.2) / dt), 2))[:, None]
+        return at + (to - at) * s**3 * (10 - 15 * s + 6 * s**2)
+
+    def _steady(self, at: np.ndarray, to: np.ndarray, dt: float, share: float, longest: float) -> np.ndarray:
+        """At constant speed, cut short where it would take too long."""
+        way = np.abs(to - at)
+        needed = float((way / (share * self.speed)).max())
+        reach = min(1.0, longest / max(needed, 1e-9))
+        rows = max(round(reach * needed / dt), 4)
+        return at + (to - at) * reach * np.linspace(0, 1, rows)[:, None]
+
+
+def _cut(q: Float[np.ndarray, "_rows dof"], n: int, dt: float) -> Float[np.ndarray, "_n dof"]:
+    """The first n rows, corners rounded, coming to rest at the end."""
+    smooth: Callable = scipy.ndimage.gaussian_filter1d
+    q = smooth(q[:n], 0.04 / dt, axis=0, mode="nearest")
+    tail = min(round(0.6 / dt), n // 4)
+    s = np.linspace(0, 1, tail)
+    clock = np.concatenate([np.arange(n - tail), n - tail + tail * (s - 0.5 * s**2)])
+    return scipy.interpolate.CubicSpline(np.arange(n), q)(np.minimum(clock, n - 1))

@@ -1,0 +1,645 @@
+"""The page of a diagnosis: what it found, the pictures that made it say so, and what it could not see."""
+
+import difflib
+import platform
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from .. import summaries
+from ..effects import CATALOGUE, AbstractEffect
+from ..report import Figure, Listing, Section, Table, number
+from .decide import Finding, coefficients
+from .diagnosis import NEXT_MOTION, Diagnosis
+from .localise import REGIMES, Localisation, lag_profile, order_spectrum, since_reversal
+
+_POINTS = 900
+"""Points of a cloud, and stretches of a curve, that a figure draws."""
+_TONES = {"consistent": "good", "explained": "bad", "partly_explained": "unsure", "unexplained": "unsure"}
+_BEFORE, _AFTER, _FIT = "#e08a1e", "#1f6fb2", "#b3202a"
+_AGAINST = {
+    "viscous_friction": "velocity",
+    "coulomb_friction": "velocity",
+    "asymmetric_friction": "velocity",
+    "stribeck_friction": "velocity",
+    "load_dependent_friction": "|load|, turned by direction",
+    "friction_drift": "time, turned by direction",
+    "presliding_hysteresis": "reversal, turned by direction",
+    "torque_ripple": "position",
+    "joint_spring": "position",
+    "encoder_offset": "position",
+    "gravity_direction": "first joint",
+    "armature": "acceleration",
+    "joint_elasticity": "load",
+    "backlash": "load",
+    "torque_gain": "model torque",
+    "torque_crosstalk": "source torque",
+    "inertial_parameters": "model torque",
+    "payload": "model torque",
+}
+"""What a finding's residual is drawn against; time where nothing stands here."""
+
+
+def sections(found: Diagnosis) -> list[Section]:
+    """The page, in the order in which a reader asks."""
+    document = found.to_json()
+    names = found.corrected.arm.joint_names
+    out = [_verdict(found, document, names)]
+    out += [_finding(found, i, one, names) for i, one in enumerate(found.findings)]
+    out.append(_held_out(found, names))
+    if found.replays:
+        out.append(_replays(found, names))
+    if found.next_motion is not None:
+        out.append(_next(found, names))
+    out += [_where(found, names), _heat_map(found, names), _exclusion(found, names)]
+    out += [_file(found), _method(found, names)]
+    return out
+
+
+def _verdict(found: Diagnosis, document: Mapping[str, Any], names: Sequence[str]) -> Section:
+    fit = document["fit"]
+    sentences = [*found.lines()]
+    if not found.findings:
+        sentences.append(
+            "Effects below the sizes in the table of what would have shown cannot be excluded: "
+            + _weakest(found)
+            + "."
+        )
+    if found.next_motion is not None:
+        told = found.next_motion.pairs[0]
+        sentences.append(
+            f"To decide between {_plain(told.finding)} and {_plain(told.rival)}, record {NEXT_MOTION}:"
+            f" {found.next_motion.kind}."
+        )
+    columns = {
+        "before": fit["rmse_before"],
+        "after": fit["rmse_after"],
+        "held out, before": fit["held_out_rmse_before"],
+        "held out, after": fit["held_out_rmse_after"],
+        "noise floor": fit["noise_floor"],
+    }
+    table = summaries.by_joint("Torque error in the band of the diagnosis, rms [N·m]", names, columns)
+    floor = np.maximum(np.asarray(fit["noise_floor"]), 1e-12)
+    shades: list[list[float | None]] = []
+    for j in range(len(names)):
+        row: list[float | None] = [None]
+        row += [-_faded(np.asarray(v)[j] / floor[j] - 1.15, 10.0) for v in list(columns.values())[:4]]
+        shades.append([*row, None])
+    shaded = Table(table.columns, table.rows, table.caption, shades)
+    return Section("Verdict", sentences, [shaded], tone=_TONES[found.verdict])
+
+
+def _weakest(found: Diagnosis) -> str:
+    """For the reader of an empty verdict: what the recordings could show of the commonest effects."""
+    parts = []
+    for name in ("coulomb_friction", "viscous_friction", "payload", "torque_offset"):
+        rows = [one for one in found.least_shown if one.effect == name and one.size is not None]
+        if rows:
+            worst = max(rows, key=lambda one: one.size or 0.0)
+            where = "" if worst.joint is None or len(rows) == 1 else f" (joint {worst.joint + 1})"
+            parts.append(f"{_plain(name)} up to {number(worst.size, 2)} {worst.unit}{where}")
+    return "; ".join(parts)
+
+
+def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -> Section:
+    sentences = [one.summary, f"Equation: {one.equation}."]
+    sentences.append(
+        f"Confidence {one.confidence:.2f}; evidence over the model without it {one.evidence:.0f} nats."
+    )
+    if one.intervals:
+        spans = ", ".join(f"{a:.2f} to {b:.2f} s" for a, b in one.intervals)
+        sentences.append(f"In {', '.join(one.recordings)}, from {spans}.")
+    tables = []
+    rows = []
+    for p in one.parameters:
+        std = p.get("std")
+        interval = (
+            "–" if std is None else f"{number(p['value'] - 1.96 * std)} … {number(p['value'] + 1.96 * std)}"
+        )
+        rows.append([p["name"], number(p["joint"]), number(p["value"]), interval, p["unit"]])
+    if rows:
+        tables.append(Table(["parameter", "joint", "value", "95 % interval", "unit"], rows))
+    tables.append(
+        summaries.by_joint(
+            "Torque that it explains, rms [N·m]", names, {"rms": [float(v) for v in one.rms_torque]}
+        )
+    )
+    if one.alternatives:
+        reveals = {c.name: c.reveals for c in CATALOGUE}
+        rows = [[_plain(name), f"{p:.2f}", reveals.get(name, "")] for name, p in one.alternatives]
+        tables.append(Table(["what else it could be", "probability", "what would show that"], rows))
+    return Section(
+        f"{place + 1}. {_plain(one.effect)}" + _at(one.joints, len(names)),
+        sentences,
+        tables,
+        [_picture(found, one, names)],
+        figures_first=True,
+    )
+
+
+def _at(joints: Sequence[int], dof: int) -> str:
+    if not joints or len(joints) == dof:
+        return ""
+    return f" at joint{'s' * (len(joints) > 1)} {', '.join(str(j + 1) for j in joints)}"
+
+
+def _plain(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _faded(value: float, strong: float) -> float:
+    """0 where value is not positive, 1 where it is `strong`, by its logarithm."""
+    return float(np.clip(np.log1p(max(value, 0.0)) / np.log1p(strong), 0.0, 1.0))
+
+
+def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
+    """The residual without everything but this finding, against what drives it, and over time."""
+    problem, state = found.problem, found.state
+    joint = int(np.argmax(one.rms_torque))
+    effect = state.terms[one.terms[0]].effect
+    for i in one.terms:  # the term that acts where most is felt
+        if joint in state.terms[i].effect.joints:
+            effect = state.terms[i].effect
+    own = [
+        sum(t.columns[r] @ coefficients(problem, state, i)[0] for i, t in _terms(found, one))
+        for r in range(len(problem.traces))
+    ]
+    _, _, after = zip(*((n, b, a) for n, _, b, a in found.residuals()), strict=True)
+    rows = [np.flatnonzero(t.weight * on > 0) for t, on in zip(problem.traces, problem.active, strict=True)]
+    fits = [np.asarray(f)[k, joint] for f, k in zip(own, rows, strict=True)]
+    lefts = [a[k, joint] + f for a, k, f in zip(after, rows, fits, strict=True)]
+    against = _AGAINST.get(one.effect, "time")
+    label, x, turned = _regime(found, effect, joint, against if one.effect != "unknown" else _of(effect))
+    signs = [s[k] for s, k in zip(turned, rows, strict=True)]
+    xs = np.concatenate([v[k] for v, k in zip(x, rows, strict=True)])
+    y = np.concatenate([r * s for r, s in zip(lefts, signs, strict=True)])
+    f = np.concatenate([r * s for r, s in zip(fits, signs, strict=True)])
+    shown = int(np.argmax([np.sum(v**2) for v in fits]))
+    trace = problem.traces[shown]
+    delayed = one.effect == "time_delay"
+    ordered = one.effect == "torque_ripple"
+
+    def draw(canvas: Any) -> None:
+        left, right = canvas.subplots(1, 2, width_ratios=[1, 1.35])
+        if delayed:
+            _draw_lags(left, found)
+        elif ordered:
+            orders, T, amplitude = order_spectrum(
+                problem, problem.design((), state.noise), state.noise, joint
+            )
+            left.vlines(orders, 0, amplitude, color=_AFTER, linewidth=0.8)
+            left.set(xlabel="order: periods in a turn of the joint", ylabel="amplitude [N·m]")
+            left.set_title("order spectrum of the residual")
+        else:
+            _draw_regime(left, xs, y, f)
+            left.set(xlabel=label, ylabel=f"residual of {names[joint]} [N·m]")
+            left.set_title("what is left without this finding, and its law")
+        time = trace.motion.time[rows[shown]]
+        _trail(right, time, lefts[shown], color="0.6", label="residual without this finding")
+        _trail(right, time, fits[shown], color=_FIT, label="what it explains")
+        for a, b in one.intervals or ():
+            right.axvspan(a, b, color=_BEFORE, alpha=0.15, linewidth=0)
+        right.set(xlabel=f"time in {_short(trace.name)} [s]", ylabel="[N·m]")
+        right.set_title(f"{names[joint]} over time")
+        right.legend(loc="upper right", fontsize=7)
+
+    return Figure(
+        draw, f"Why: the residual of {names[joint]} against {label if not delayed else 'lag'}", (10.0, 3.4)
+    )
+
+
+def _terms(found: Diagnosis, one: Finding):
+    return [(i, found.state.terms[i]) for i in one.terms]
+
+
+def _short(name: str) -> str:
+    return name if len(name) < 40 else name[:37] + "…"
+
+
+def _of(effect: AbstractEffect) -> str:
+    """What a free form is a function of."""
+    form = getattr(effect, "form", "")
+    return {
+        "odd in dq": "velocity",
+        "even in dq": "velocity",
+        "of q": "position",
+        "of load": "load",
+        "friction of q": "position, turned by direction",
+        "friction of load": "|load|, turned by direction",
+        "of ddq": "acceleration",
+        "of q_k": "source position",
+        "odd in dq_k": "source velocity",
+    }.get(form, "time")
+
+
+def _regime(found: Diagnosis, effect: AbstractEffect, joint: int, against: str):
+    """A label, the variable in each recording, and by which sign the residual is turned."""
+    traces = found.problem.traces
+    source = int(getattr(effect, "source", joint))
+    what = against.split(",")[0]
+    label, part = {
+        "velocity": (f"velocity of joint {joint + 1} [rad/s]", lambda t: t.motion.qd[:, joint]),
+        "position": (f"position of joint {joint + 1} [rad]", lambda t: t.motion.q[:, joint]),
+        "acceleration": (f"acceleration of joint {joint + 1} [rad/s²]", lambda t: t.motion.qdd[:, joint]),
+        "load": (f"load on joint {joint + 1} [N·m]", lambda t: t.motion.load[:, joint]),
+        "|load|": (f"size of the load on joint {joint + 1} [N·m]", lambda t: np.abs(t.motion.load[:, joint])),
+        "model torque": (
+            f"torque of the model at joint {joint + 1} [N·m]",
+            lambda t: t.motion.torque[:, joint],
+        ),
+        "source torque": (
+            f"torque of the model at joint {source + 1} [N·m]",
+            lambda t: t.motion.torque[:, source],
+        ),
+        "source position": (f"position of joint {source + 1} [rad]", lambda t: t.motion.q[:, source]),
+        "source velocity": (f"velocity of joint {source + 1} [rad/s]", lambda t: t.motion.qd[:, source]),
+        "first joint": ("position of joint 1 [rad]", lambda t: t.motion.q[:, 0]),
+        "reversal": (
+            "distance since the last reversal [rad]",
+            lambda t: np.where(since_reversal(t, joint) > 0.2, np.nan, since_reversal(t, joint)),
+        ),
+        "time": ("time [s]", lambda t: t.motion.time),
+    }[what]
+    x = [np.asarray(part(t)) for t in traces]
+    turned = [
+        np.sign(t.motion.qd[:, joint]) if "turned" in against else np.ones(t.motion.samples) for t in traces
+    ]
+    if "turned" in against:
+        label += "; torque times the sign of the velocity"
+    return label, x, turned
+
+
+def _draw_regime(axis: Any, x: np.ndarray, y: np.ndarray, f: np.ndarray) -> None:
+    """Cloud, means in bins with their spread, and the law in the same bins."""
+    good = np.isfinite(x)
+    x, y, f = x[good], y[good], f[good]
+    thin = slice(None, None, max(1, len(x) // _POINTS))
+    axis.plot(x[thin], y[thin], ".", color="0.75", markersize=2, zorder=1)
+    order = np.argsort(x)
+    parts = [p for p in np.array_split(order, 40) if len(p) > 4]
+    middle = np.array([x[p].mean() for p in parts])
+    axis.errorbar(
+        middle,
+        [y[p].mean() for p in parts],
+        [2 * y[p].std() / np.sqrt(len(p)) for p in parts],
+        fmt="o",
+        color="0.2",
+        markersize=2.5,
+        linewidth=0.8,
+        label="mean residual, ± 2 deviations",
+        zorder=2,
+    )
+    axis.plot(middle, [f[p].mean() for p in parts], color=_FIT, linewidth=1.6, label="law found", zorder=3)
+    axis.legend(loc="best", fontsize=7)
+
+
+def _draw_lags(axis: Any, found: Diagnosis) -> None:
+    noise = found.state.noise
+    design = found.problem.design((), noise)
+    for j in range(found.problem.dof):
+        lags, gain = lag_profile(found.problem, design, noise, j)
+        axis.plot(1e3 * lags, gain - gain[len(lags) // 2], label=f"joint {j + 1}", linewidth=1.0)
+    axis.set_yscale("symlog", linthresh=10)
+    axis.set(xlabel="torque late by [ms]", ylabel="gain of log likelihood [nats]")
+    axis.set_title("lag scan between torque and model")
+    axis.legend(fontsize=6, ncols=2)
+
+
+def _trail(axis: Any, time: Float[np.ndarray, " time"], y: Float[np.ndarray, " time"], **style: Any) -> None:
+    """A curve with no more points than a screen shows, its extremes kept."""
+    count = len(y) // _POINTS
+    if count < 2:
+        axis.plot(time, y, **style)
+        return
+    whole = len(y) // (2 * count) * (2 * count)
+    blocks = y[:whole].reshape(-1, 2 * count)
+    clock = time[:whole].reshape(-1, 2 * count)[:, [0, count]]
+    axis.plot(clock.ravel(), np.stack([blocks.min(1), blocks.max(1)], 1).ravel(), **style)
+
+
+def _held_out(found: Diagnosis, names: Sequence[str]) -> Section:
+    figures = []
+    rows = zip(found.problem.traces, found.problem.active, found.residuals(), found.held_out, strict=True)
+    for trace, on, (name, time, before, _), (after, counts) in rows:
+        if len(figures) == 2 or not on:
+            continue
+        figures.append(
+            _curves(name, time, before, np.where(counts[:, None], after, np.nan), names, trace.weight)
+        )
+    sentences = [
+        "What is left of the measured torque: by your simulation, and by the corrected one, whose coefficients were"
+        " fitted to other blocks of the recordings than those shown. What happened once has no other block, and is"
+        " left out."
+    ]
+    if sum(found.problem.active) > len(figures):
+        sentences.append(f"The first {len(figures)} of {sum(found.problem.active)} recordings are drawn.")
+    return Section("Before and after, on data held out", sentences, figures=figures)
+
+
+def _curves(
+    name: str,
+    time: Float[np.ndarray, " time"],
+    before: Float[np.ndarray, "time dof"],
+    after: Float[np.ndarray, "time dof"],
+    names: Sequence[str],
+    weight: Float[np.ndarray, " time"],
+) -> Figure:
+    def draw(canvas: Any) -> None:
+        axes = canvas.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        for j, axis in enumerate(axes):
+            _trail(
+                axis, time, np.where(weight > 0, before[:, j], np.nan), color=_BEFORE, label="your simulation"
+            )
+            _trail(axis, time, after[:, j], color=_AFTER, label="corrected, held out")
+            axis.set_ylabel(f"{names[j]}\n[N·m]")
+        axes[0].legend(loc="upper right", ncols=2, fontsize=7)
+        axes[-1].set_xlabel("time [s]")
+
+    return Figure(draw, f"{name}: measured less modelled torque", size=(10.0, 1.05 * len(names)))
+
+
+def _replays(found: Diagnosis, names: Sequence[str]) -> Section:
+    tables = []
+    for one in found.replays:
+        columns = {
+            f"{what.replace('_', ' ').replace('rmse rad', 'tracking [rad]')}, {when}": one.get(
+                f"{what}_{when}"
+            )
+            for what in ("rmse_rad", "feedback_rms")
+            for when in ("before", "after")
+        }
+        tables.append(summaries.by_joint(f"{one.get('recording', '')}: replayed in MuJoCo", names, columns))
+    return Section(
+        "Simulated again",
+        [
+            "Your simulation and the corrected one follow the recorded motion under the recorded torque and the same weak feedback."
+        ],
+        tables,
+    )
+
+
+def _next(found: Diagnosis, names: Sequence[str]) -> Section:
+    motion = found.next_motion
+    assert motion is not None
+    rows = [
+        [
+            f"{_plain(p.finding)} or {_plain(p.rival)}",
+            number(None if p.joint is None else p.joint + 1),
+            f"{p.nats:.1f}",
+            f"{p.nats_repeated:.1f}",
+        ]
+        for p in motion.pairs
+    ]
+    tried = [[kind, f"{nats:.1f}"] for kind, nats in sorted(motion.tried, key=lambda one: -one[1])]
+    again = motion.kind == motion.tried[0][0]
+
+    def draw(canvas: Any) -> None:
+        axis = canvas.subplots()
+        for j, name in enumerate(names):
+            _trail(axis, motion.time, motion.q[:, j], label=name)
+        axis.set(xlabel="time [s]", ylabel="[rad]")
+        axis.legend(ncols=len(names), fontsize=7, loc="upper right")
+
+    return Section(
+        "The experiment that would decide",
+        [
+            f"These recordings leave more than one explanation. Most would be learned from {motion.kind}"
+            f"{' (nothing tried does better)' if again else ''}: {motion.time[-1]:.0f} s, written to {NEXT_MOTION}.",
+            "It stays within the joints' limits and near the box that was recorded, but knows nothing of the arm's"
+            " surroundings: look at it before it is run.",
+        ],
+        [
+            Table(
+                ["to decide between", "joint", "expected of this motion", "of the recorded one again"],
+                rows,
+                "Expected evidence for whichever is true [nats]; 5 is one in 150",
+            ),
+            Table(["motion", "nats"], tried, "What was compared, by the pair that it tells least"),
+        ],
+        [Figure(draw, f"{NEXT_MOTION}: joint positions", (10.0, 2.4))],
+    )
+
+
+def _where(found: Diagnosis, names: Sequence[str]) -> Section:
+    before, after = found.localisation
+    sentences = [
+        "Share of each joint's whitened residual that goes with a regime, what noise would give taken off; empty"
+        " where it is within noise, all joints and regimes taken together. Regimes overlap: friction shows under"
+        " direction, speed and load at once."
+    ]
+    tables = [_regimes("Your simulation", before, names)]
+    if found.findings:
+        tables.append(_regimes("With the findings", after, names))
+    rows = []
+    for when, one in (("before", before), ("after", after)) if found.findings else (("before", before),):
+        rows += [
+            [
+                names[o.joint],
+                when,
+                f"order {number(o.order, 3)}",
+                f"{number(o.amplitude, 2)} N·m",
+                _chance(o.p),
+            ]
+            for o in one.orders
+            if o.beyond
+        ]
+        rows += [
+            [
+                names[lag.joint],
+                when,
+                "torque late",
+                f"{1e3 * lag.lag:.1f} ± {1e3 * lag.std:.1f} ms",
+                _chance(lag.p),
+            ]
+            for lag in one.lags
+            if lag.beyond
+        ]
+        strongest = sorted(one.changes, key=lambda c: -abs(c.z))[:6]
+        rows += [
+            [
+                names[c.joint],
+                when,
+                f"{c.kind} changes",
+                f"{_short(c.recording)}, {c.time:.2f} s",
+                f"z = {c.z:.1f}",
+            ]
+            for c in sorted(strongest, key=lambda c: (c.joint, c.time))
+        ]
+    if rows:
+        tables.append(
+            Table(
+                ["joint", "model", "what", "where, how much", "chance of noise"],
+                rows,
+                "Orders of position, lags, strongest change points",
+            )
+        )
+    else:
+        sentences.append("No order of position, no lag and no change point is beyond noise.")
+    return Section("Where the difference lies", sentences, tables)
+
+
+def _chance(p: float) -> str:
+    return f"{p:.0e}" if p > 1e-12 else "< 1e-12"
+
+
+def _regimes(caption: str, one: Localisation, names: Sequence[str]) -> Table:
+    rows, shades = [], []
+    for regime in REGIMES:
+        cells = [r for r in one.regimes if r.name == regime]
+        rows.append([f"{regime}", *(f"{100 * c.share:.1f} %" if c.beyond else "" for c in cells)])
+        shades.append([None, *(c.share**0.5 if c.beyond else None for c in cells)])
+    return Table(["by", *names], rows, caption, shades)
+
+
+def _heat_map(found: Diagnosis, names: Sequence[str]) -> Section:
+    heat = found.heat_map
+    held = {(f.effect, j) for f in found.findings for j in f.joints}
+
+    def table(values: np.ndarray, caption: str, marked: bool) -> Table:
+        rows, shades = [], []
+        for effect, gains in zip(heat.effects, values, strict=True):
+            if np.all(np.isnan(gains)):
+                continue
+            found_here = [marked and (effect, j) in held for j in range(len(names))]
+            rows.append(
+                [
+                    _plain(effect),
+                    *(
+                        "" if np.isnan(g) else _gain(g) + " ●" * m
+                        for g, m in zip(gains, found_here, strict=True)
+                    ),
+                ]
+            )
+            shades.append([None, *(None if np.isnan(g) or g < 3 else _faded(g, 3000.0) for g in gains)])
+        return Table(["effect", *names], rows, caption, shades)
+
+    tables = [table(heat.alone, "One effect alone added to your simulation; ● was found", True)]
+    if found.findings:
+        tables.append(table(heat.beside, "One more effect beside everything found", False))
+    return Section(
+        "Every effect at every joint",
+        [
+            "Gain of log likelihood [nats] on blocks of the recordings that the effect was not fitted to, in its best"
+            " shape; negative where it makes them worse. What acts in the whole arm is split into each joint's share;"
+            " what happens once (a contact, a change of payload) has no second block to be tested on."
+        ],
+        tables,
+    )
+
+
+def _gain(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}"
+
+
+def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
+    rows, shades = [], []
+    for effect in dict.fromkeys(one.effect for one in found.least_shown):
+        cells = {one.joint: one for one in found.least_shown if one.effect == effect}
+        first = next(iter(cells.values()))
+        whole = cells.get(None)
+        row = [f"{_plain(effect)}: {first.parameter} [{first.unit}]"]
+        shade: list[float | None] = [None]
+        for j in range(len(names)):
+            one = whole if whole is not None else cells.get(j)
+            if one is None:
+                row.append("")
+                shade.append(None)
+                continue
+            row.append(
+                "not seen"
+                if one.size is None or one.rms_torque is None
+                else f"{number(one.size, 2)} ({number(one.rms_torque, 2)})"
+            )
+            shade.append(-0.5 if one.size is None else -0.35 * (one.survives < 0.05) or None)
+        rows.append(row)
+        shades.append(shade)
+    return Section(
+        "What would have shown",
+        [
+            "The smallest size of each effect that would have been found in these recordings"
+            + (" beside the findings" if found.findings else "")
+            + ", in its unit, and in brackets as N·m rms at the joint that feels it most. What is smaller cannot be"
+            " excluded. Coloured: more than 95 % of the effect is absorbed by what is refitted anyway.",
+        ],
+        [Table(["effect: parameter [unit]", *names], rows, "", shades)],
+    )
+
+
+def _file(found: Diagnosis) -> Section:
+    lines = []
+    for line in difflib.unified_diff(
+        found.model_xml.splitlines(),
+        found.corrected_xml.splitlines(),
+        "your model",
+        "corrected.xml",
+        "",
+        "",
+        2,
+        "",
+    ):
+        kind = "note" if line[:2] in ("++", "--", "@@") else {"+": "add", "-": "cut"}.get(line[:1], "")
+        lines.append((kind, line))
+    cannot = [note for note in found.notes if note.startswith("corrected.xml")]
+    sentences = [
+        "What MuJoCo's own attributes can hold of the findings:"
+        if lines
+        else "corrected.xml is your file as it was."
+    ]
+    sentences += cannot
+    beyond = [e.name for e, _ in found.corrected.beyond]
+    if beyond:
+        sentences.append(
+            f"{', '.join(map(_plain, dict.fromkeys(beyond)))}: `jaxpanda predict` and the corrected model in Python have"
+            " it all the same."
+        )
+    many = len(lines) > 60
+    caption = f"Difference, {len(lines)} lines" if many else ""
+    return Section("Your file", sentences, listings=[Listing(lines, caption, many)] if lines else [])
+
+
+def _method(found: Diagnosis, names: Sequence[str]) -> Section:
+    problem, noise = found.problem, found.state.noise
+    localised = found.localisation[1]
+    trace = problem.traces[0]
+    rates = sorted({round(1 / t.motion.dt) for t in problem.traces})
+    cutoffs = sorted({round(t.cutoff, 1) for t in problem.traces})
+    sentences = [
+        f"Torque and model were low-passed at {_listed(cutoffs)} Hz and compared at {_listed(rates)} Hz; physics with"
+        f" corners was evaluated at {1 / trace.dt:.0f} Hz and filtered like the torque.",
+        f"The model's own numbers were taken as known as “{found.knowledge}” says: "
+        + {
+            "exact": "inertial parameters and friction as they stand.",
+            "identified": "as an identification motion would have left them, friction to 2 %.",
+            "rough": "masses to 4 %, centres of mass to 3 mm, inertias to 10 %, friction to 20 %.",
+            "unknown": "not at all.",
+        }[found.knowledge],
+    ]
+    sentences += [note for note in found.notes if not note.startswith("corrected.xml")]
+    table = summaries.by_joint(
+        "Noise beside everything found: autoregressive of order 3",
+        names,
+        {
+            "deviation [N·m]": noise.std,
+            "innovations [N·m]": noise.sigma,
+            **{f"a{k + 1}": noise.a[:, k] for k in range(noise.a.shape[1])},
+            f"samples that count, of {localised.samples}": localised.effective_samples,
+        },
+    )
+    tables = [table]
+    if found.sources:
+        rows = [[one["name"], one["role"], one["sha256"]] for one in found.sources]
+        tables.append(Table(["file", "role", "sha256"], rows, "What went in"))
+    packages = ("jaxpanda", "jax", "mujoco", "numpy", "scipy")
+    versions = ", ".join(f"{name} {metadata.version(name)}" for name in packages)
+    sentences.append(f"Python {platform.python_version()} on {platform.system()}; {versions}.")
+    log = Listing(
+        [("", line) for line in found.log], f"What the search tried, {len(found.log)} lines", folded=True
+    )
+    return Section("How this was found", sentences, tables, listings=[log] if found.log else [])
+
+
+def _listed(values: Sequence[float]) -> str:
+    return ", ".join(f"{v:g}" for v in values)
