@@ -75,22 +75,40 @@ class Least:
 def heat_map(problem: Problem, state: State) -> HeatMap:
     """The best shape of every effect at every joint, by evidence, and what it gains on held-out blocks."""
     names = [c.name for c in CATALOGUE]
-    alone = _gains(problem, problem.design((), state.noise), state.noise, names)
-    beside = _gains(problem, state.design, state.noise, names) if state.terms else alone
-    return HeatMap(tuple(names), alone, beside)
+    groups = [*problem.library, *problem.catchalls]
+    second = _best(problem, state.design, state.noise, groups)
+    if not state.terms:
+        gains = _gains(problem, state.design, state.noise, names, second)
+        return HeatMap(tuple(names), gains, gains)
+    nominal = problem.design((), state.noise)
+    touched = {j for t in state.terms for j in range(problem.dof) if any(np.any(c[:, j]) for c in t.columns)}
+    again = [g for g in groups if g.joint is None or g.joint in touched]
+    first = {**second, **_best(problem, nominal, state.noise, again)}
+    return HeatMap(
+        tuple(names),
+        _gains(problem, nominal, state.noise, names, first),
+        _gains(problem, state.design, state.noise, names, second),
+    )
+
+
+Best = dict[tuple[str, tuple[int, ...]], tuple[Proposal, tuple[Candidates, int] | None]]
+
+
+def _best(problem: Problem, design: Design, noise: Noise, groups: Sequence[Candidates]) -> Best:
+    """The likeliest shape of each effect at each place, and where in the groups it stands."""
+    best: Best = {}
+    places = {id(e): (g, i) for g in groups for i, e in enumerate(g.effects)}
+    for p in (*grids(problem, design, noise, groups), *ripple(problem, design, noise)):
+        if not p.effect.bound_to_recording and (p.key not in best or p.evidence > best[p.key][0].evidence):
+            best[p.key] = p, places.get(id(p.effect))
+    return best
 
 
 def _gains(
-    problem: Problem, design: Design, noise: Noise, names: Sequence[str]
+    problem: Problem, design: Design, noise: Noise, names: Sequence[str], best: Best
 ) -> Float[np.ndarray, "effects dof"]:
-    best: dict[tuple[str, tuple[int, ...]], Proposal] = {}
-    groups = [*problem.library, *problem.catchalls]
-    places = {id(e): (g, i) for g in groups for i, e in enumerate(g.effects)}
-    for p in (*grids(problem, design, noise, groups), *ripple(problem, design, noise)):
-        if not p.effect.bound_to_recording and (p.key not in best or p.evidence > best[p.key].evidence):
-            best[p.key] = p
-    chosen = list(best.values())
-    columns = [_whitened(problem, noise, p.effect, places.get(id(p.effect))) for p in chosen]
+    chosen = [p for p, _ in best.values()]
+    columns = [_whitened(problem, noise, p.effect, place) for p, place in best.values()]
     gains = held_out_gains(problem, design, columns, [p.deviation for p in chosen])
     out = np.full((len(names), problem.dof), np.nan)
     for p, gain in zip(chosen, gains, strict=True):
@@ -106,6 +124,9 @@ def _whitened(
     problem: Problem, noise: Noise, effect: AbstractEffect, place: tuple[Candidates, int] | None
 ) -> dict[int, np.ndarray]:
     """An effect's whitened columns in the joints where it acts."""
+    if isinstance(effect, TorqueRipple) and effect.form == "one":
+        j = effect.joints[0]
+        return {j: problem.whitened([c[:, 0] for c in _waves(problem, [effect])], noise, j)}
     if place is None:
         wide = problem.full_columns([effect])
     elif isinstance(effect, AbstractJointEffect):
@@ -116,6 +137,15 @@ def _whitened(
         wide = [c[:, :, place[1]] for c in place[0].columns]
     felt = [j for j in range(problem.dof) if any(np.any(c[:, j]) for c in wide)]
     return {j: problem.whitened([c[:, j] for c in wide], noise, j) for j in felt}
+
+
+def _waves(problem: Problem, ripples: Sequence[TorqueRipple]) -> list[Float[np.ndarray, "_time m 2"]]:
+    """Columns of ripples at one joint, on the coarse grid."""
+    j, orders = ripples[0].joints[0], np.array([float(e.order) for e in ripples])
+    angles = [
+        t.motion.q[:, j, None] * orders * on for t, on in zip(problem.traces, problem.active, strict=True)
+    ]
+    return [np.stack([np.sin(a), np.cos(a)], 2) for a in angles]
 
 
 def held_out_gains(
@@ -197,10 +227,12 @@ def least_shown(problem: Problem, state: State) -> tuple[Least, ...]:
             continue
         rows[key] = found if held and held[0][0] > count else [*held, *found]
     for effects in _beyond_the_library(problem):
-        wide = [problem.full_columns([e]) for e in effects]
-        columns = [np.stack([w[r] for w in wide], 2) for r in range(len(problem.traces))]
-        if isinstance(effects[0], AbstractJointEffect):
-            columns = [c[:, effects[0].joints[0]] for c in columns]
+        ripples = [e for e in effects if isinstance(e, TorqueRipple)]
+        if ripples:
+            columns = _waves(problem, ripples)
+        else:
+            wide = [problem.full_columns([e]) for e in effects]
+            columns = [np.stack([w[r] for w in wide], 2) for r in range(len(problem.traces))]
         key = effects[0].name, effects[0].joints[0]
         rows[key] = [(0, one) for one in _least(problem, state, effects, columns)]
     out = []

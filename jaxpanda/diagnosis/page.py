@@ -122,11 +122,8 @@ def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -
         rows.append([p["name"], number(p["joint"]), number(p["value"]), interval, p["unit"]])
     if rows:
         tables.append(Table(["parameter", "joint", "value", "95 % interval", "unit"], rows))
-    tables.append(
-        summaries.by_joint(
-            "Torque that it explains, rms [N·m]", names, {"rms": [float(v) for v in one.rms_torque]}
-        )
-    )
+    felt = ["rms", *(number(float(v), 3) for v in one.rms_torque)]
+    tables.append(Table(["", *names], [felt], "Torque that it explains [N·m]"))
     if one.alternatives:
         reveals = {c.name: c.reveals for c in CATALOGUE}
         rows = [[_plain(name), f"{p:.2f}", reveals.get(name, "")] for name, p in one.alternatives]
@@ -184,10 +181,11 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
 
     def draw(canvas: Any) -> None:
         left, right = canvas.subplots(1, 2, width_ratios=[1, 1.35])
+        canvas.subplots_adjust(left=0.07, right=0.995, bottom=0.14, top=0.92, wspace=0.16)
         if delayed:
             _draw_lags(left, found)
         elif ordered:
-            orders, T, amplitude = order_spectrum(
+            orders, _, amplitude = order_spectrum(
                 problem, problem.design((), state.noise), state.noise, joint
             )
             left.vlines(orders, 0, amplitude, color=_AFTER, linewidth=0.8)
@@ -207,7 +205,10 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
         right.legend(loc="upper right", fontsize=7)
 
     return Figure(
-        draw, f"Why: the residual of {names[joint]} against {label if not delayed else 'lag'}", (10.0, 3.4)
+        draw,
+        f"Why: the residual of {names[joint]} against {label if not delayed else 'lag'}",
+        (10.0, 3.4),
+        None,
     )
 
 
@@ -215,8 +216,8 @@ def _terms(found: Diagnosis, one: Finding):
     return [(i, found.state.terms[i]) for i in one.terms]
 
 
-def _short(name: str) -> str:
-    return name if len(name) < 40 else name[:37] + "…"
+def _short(name: str, most: int = 40) -> str:
+    return name if len(name) <= most else name[: most - 1] + "…"
 
 
 def _of(effect: AbstractEffect) -> str:
@@ -297,13 +298,14 @@ def _draw_regime(axis: Any, x: np.ndarray, y: np.ndarray, f: np.ndarray) -> None
 
 
 def _draw_lags(axis: Any, found: Diagnosis) -> None:
+    """Gain of every joint over its own best, so that all stand in one picture."""
     noise = found.state.noise
     design = found.problem.design((), noise)
     for j in range(found.problem.dof):
         lags, gain = lag_profile(found.problem, design, noise, j)
-        axis.plot(1e3 * lags, gain - gain[len(lags) // 2], label=f"joint {j + 1}", linewidth=1.0)
-    axis.set_yscale("symlog", linthresh=10)
-    axis.set(xlabel="torque late by [ms]", ylabel="gain of log likelihood [nats]")
+        gain = gain / max(float(gain.max()), 1.0)
+        axis.plot(1e3 * lags, np.where(gain < -1, np.nan, gain), label=f"joint {j + 1}", linewidth=1.0)
+    axis.set(xlabel="torque late by [ms]", ylabel="gain of likelihood, of each joint's best", ylim=(-1, 1.1))
     axis.set_title("lag scan between torque and model")
     axis.legend(fontsize=6, ncols=2)
 
@@ -330,9 +332,9 @@ def _held_out(found: Diagnosis, names: Sequence[str]) -> Section:
             _curves(name, time, before, np.where(counts[:, None], after, np.nan), names, trace.weight)
         )
     sentences = [
-        "What is left of the measured torque: by your simulation, and by the corrected one, whose coefficients were"
-        " fitted to other blocks of the recordings than those shown. What happened once has no other block, and is"
-        " left out."
+        "What is left of the measured torque: by your simulation, and by the corrected one, whose coefficients"
+        " were fitted to other blocks of the recordings than those shown. What happened once has no other block,"
+        " and is left out."
     ]
     if sum(found.problem.active) > len(figures):
         sentences.append(f"The first {len(figures)} of {sum(found.problem.active)} recordings are drawn.")
@@ -349,16 +351,19 @@ def _curves(
 ) -> Figure:
     def draw(canvas: Any) -> None:
         axes = canvas.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        room = 1.05 * len(names)
+        canvas.subplots_adjust(left=0.075, right=0.995, bottom=0.4 / room, top=1 - 0.1 / room, hspace=0.18)
         for j, axis in enumerate(axes):
             _trail(
                 axis, time, np.where(weight > 0, before[:, j], np.nan), color=_BEFORE, label="your simulation"
             )
             _trail(axis, time, after[:, j], color=_AFTER, label="corrected, held out")
-            axis.set_ylabel(f"{names[j]}\n[N·m]")
+            axis.set_ylabel(f"{_short(names[j], 14)}\n[N·m]")
+            axis.locator_params(axis="y", nbins=4)
         axes[0].legend(loc="upper right", ncols=2, fontsize=7)
         axes[-1].set_xlabel("time [s]")
 
-    return Figure(draw, f"{name}: measured less modelled torque", size=(10.0, 1.05 * len(names)))
+    return Figure(draw, f"{name}: measured less modelled torque", (10.0, 1.05 * len(names)), None)
 
 
 def _replays(found: Diagnosis, names: Sequence[str]) -> Section:
@@ -375,7 +380,8 @@ def _replays(found: Diagnosis, names: Sequence[str]) -> Section:
     return Section(
         "Simulated again",
         [
-            "Your simulation and the corrected one follow the recorded motion under the recorded torque and the same weak feedback."
+            "Your simulation and the corrected one follow the recorded motion under the recorded torque and the"
+            " same weak feedback."
         ],
         tables,
     )
@@ -398,6 +404,7 @@ def _next(found: Diagnosis, names: Sequence[str]) -> Section:
 
     def draw(canvas: Any) -> None:
         axis = canvas.subplots()
+        canvas.subplots_adjust(left=0.06, right=0.995, bottom=0.18, top=0.97)
         for j, name in enumerate(names):
             _trail(axis, motion.time, motion.q[:, j], label=name)
         axis.set(xlabel="time [s]", ylabel="[rad]")
@@ -407,9 +414,9 @@ def _next(found: Diagnosis, names: Sequence[str]) -> Section:
         "The experiment that would decide",
         [
             f"These recordings leave more than one explanation. Most would be learned from {motion.kind}"
-            f"{' (nothing tried does better)' if again else ''}: {motion.time[-1]:.0f} s, written to {NEXT_MOTION}.",
-            "It stays within the joints' limits and near the box that was recorded, but knows nothing of the arm's"
-            " surroundings: look at it before it is run.",
+            f"{' (nothing tried does better)' if again else ''}: {motion.time[-1]:.0f} s, in {NEXT_MOTION}.",
+            "It stays within the joints' limits and near the box that was recorded, but knows nothing of what stands"
+            " around the arm: look at it before it is run.",
         ],
         [
             Table(
@@ -419,7 +426,7 @@ def _next(found: Diagnosis, names: Sequence[str]) -> Section:
             ),
             Table(["motion", "nats"], tried, "What was compared, by the pair that it tells least"),
         ],
-        [Figure(draw, f"{NEXT_MOTION}: joint positions", (10.0, 2.4))],
+        [Figure(draw, f"{NEXT_MOTION}: joint positions", (10.0, 2.4), None)],
     )
 
 
@@ -540,7 +547,7 @@ def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
         cells = {one.joint: one for one in found.least_shown if one.effect == effect}
         first = next(iter(cells.values()))
         whole = cells.get(None)
-        row = [f"{_plain(effect)}: {first.parameter} [{first.unit}]"]
+        row = [f"{_plain(effect)}\n{first.parameter} [{first.unit}]"]
         shade: list[float | None] = [None]
         for j in range(len(names)):
             one = whole if whole is not None else cells.get(j)
@@ -551,7 +558,7 @@ def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
             row.append(
                 "not seen"
                 if one.size is None or one.rms_torque is None
-                else f"{number(one.size, 2)} ({number(one.rms_torque, 2)})"
+                else f"{number(one.size, 2)}\n{number(one.rms_torque, 2)} N·m"
             )
             shade.append(-0.5 if one.size is None else -0.35 * (one.survives < 0.05) or None)
         rows.append(row)
@@ -561,10 +568,10 @@ def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
         [
             "The smallest size of each effect that would have been found in these recordings"
             + (" beside the findings" if found.findings else "")
-            + ", in its unit, and in brackets as N·m rms at the joint that feels it most. What is smaller cannot be"
+            + ", in its unit, and below that as rms torque at the joint that feels it most. What is smaller cannot be"
             " excluded. Coloured: more than 95 % of the effect is absorbed by what is refitted anyway.",
         ],
-        [Table(["effect: parameter [unit]", *names], rows, "", shades)],
+        [Table(["effect", *names], rows, "", shades)],
     )
 
 
