@@ -6,6 +6,7 @@ the tool does against an independent simulator is shown under `experiments/`.
 
 import dataclasses
 import json
+import re
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ import pytest
 
 from jaxpanda import Arm, InputError, Recording
 from jaxpanda.corrected import Corrected
-from jaxpanda.diagnosis import diagnose, predict
+from jaxpanda.diagnosis import diagnose, page, predict
 from jaxpanda.diagnosis.decide import called
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check
@@ -24,6 +25,7 @@ from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.friction import StribeckFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
+from jaxpanda.report import to_html
 
 NOISE = 0.05
 
@@ -99,6 +101,28 @@ def test_prediction_from_the_saved_folder_reproduces_a_motion_never_seen(found, 
     error = np.sqrt(np.mean((tau - other.tau) ** 2, 0))
     assert tau.shape == other.tau.shape
     np.testing.assert_allclose(error, NOISE, rtol=0.1)
+
+
+def test_the_heat_map_is_hottest_where_the_effect_was_concealed(found):
+    heat = found.heat_map
+    row = heat.alone[heat.effects.index("stribeck_friction")]
+    assert row.argmax() == 4
+    assert row[4] == pytest.approx(np.nanmax(heat.alone), rel=0.1)
+    assert np.nanmax(heat.beside) < 0.05 * row[4]
+
+
+def test_the_page_stands_alone_and_escapes_what_users_named(found, tmp_path):
+    sources = ({"role": "recording", "name": "<script>alert(1)</script>.csv", "sha256": "0"},)
+    shown = dataclasses.replace(found, sources=sources)
+    to_html("diagnosis", page.sections(shown), tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text("utf-8")
+    assert "<script" not in text
+    assert "&lt;script&gt;" in text
+    outside = set(re.findall(r"https?://[^\s\"'<]+", text))
+    assert all(url.startswith("http://www.w3.org/") for url in outside)
+    for part in ("1. stribeck friction at joint 5", "95 % interval", "What would have shown", "Every effect"):
+        assert part in text
+    assert text.count("<svg") >= 3
 
 
 def test_two_effects_are_both_found_and_nothing_else():

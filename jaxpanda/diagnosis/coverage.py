@@ -98,7 +98,7 @@ def _best(problem: Problem, design: Design, noise: Noise, groups: Sequence[Candi
     """The likeliest shape of each effect at each place, and where in the groups it stands."""
     best: Best = {}
     places = {id(e): (g, i) for g in groups for i, e in enumerate(g.effects)}
-    for p in (*grids(problem, design, noise, groups), *ripple(problem, design, noise)):
+    for p in (*grids(problem, design, noise, groups), *ripple(problem, design, noise, range(problem.dof))):
         if not p.effect.bound_to_recording and (p.key not in best or p.evidence > best[p.key][0].evidence):
             best[p.key] = p, places.get(id(p.effect))
     return best

@@ -193,7 +193,7 @@ def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
     groups = [g for g in (*problem.library, *problem.catchalls) if g.name in rivals]
     proposals = [*grids(problem, design, state.noise, groups)]
     if "torque_ripple" in rivals:
-        proposals += ripple(problem, design, state.noise)
+        proposals += ripple(problem, design, state.noise, term.effect.joints)
     best: dict[str, Proposal] = {}
     for p in proposals:
         name = p.effect.name

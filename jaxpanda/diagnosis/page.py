@@ -415,8 +415,8 @@ def _next(found: Diagnosis, names: Sequence[str]) -> Section:
         [
             f"These recordings leave more than one explanation. Most would be learned from {motion.kind}"
             f"{' (nothing tried does better)' if again else ''}: {motion.time[-1]:.0f} s, in {NEXT_MOTION}.",
-            "It stays within the joints' limits and near the box that was recorded, but knows nothing of what stands"
-            " around the arm: look at it before it is run.",
+            "It stays within the joints' limits and near the box that was recorded, but knows nothing of what"
+            " stands around the arm: look at it before it is run.",
         ],
         [
             Table(
@@ -529,9 +529,9 @@ def _heat_map(found: Diagnosis, names: Sequence[str]) -> Section:
     return Section(
         "Every effect at every joint",
         [
-            "Gain of log likelihood [nats] on blocks of the recordings that the effect was not fitted to, in its best"
-            " shape; negative where it makes them worse. What acts in the whole arm is split into each joint's share;"
-            " what happens once (a contact, a change of payload) has no second block to be tested on."
+            "Gain of log likelihood [nats] on blocks of the recordings that the effect was not fitted to, in its"
+            " best shape; negative where it makes them worse. What acts in the whole arm is split into the joints'"
+            " shares; what happens once (a contact, a change of payload) has no second block to be tested on."
         ],
         tables,
     )
@@ -568,8 +568,8 @@ def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
         [
             "The smallest size of each effect that would have been found in these recordings"
             + (" beside the findings" if found.findings else "")
-            + ", in its unit, and below that as rms torque at the joint that feels it most. What is smaller cannot be"
-            " excluded. Coloured: more than 95 % of the effect is absorbed by what is refitted anyway.",
+            + ", in its unit, and below that as rms torque at the joint that feels it most. What is smaller"
+            " cannot be excluded. Coloured: over 95 % of the effect is absorbed by what is refitted anyway.",
         ],
         [Table(["effect", *names], rows, "", shades)],
     )
@@ -599,8 +599,8 @@ def _file(found: Diagnosis) -> Section:
     beyond = [e.name for e, _ in found.corrected.beyond]
     if beyond:
         sentences.append(
-            f"{', '.join(map(_plain, dict.fromkeys(beyond)))}: `jaxpanda predict` and the corrected model in Python have"
-            " it all the same."
+            f"{', '.join(map(_plain, dict.fromkeys(beyond)))}: `jaxpanda predict` and the corrected model in"
+            " Python have it all the same."
         )
     many = len(lines) > 60
     caption = f"Difference, {len(lines)} lines" if many else ""
@@ -614,8 +614,8 @@ def _method(found: Diagnosis, names: Sequence[str]) -> Section:
     rates = sorted({round(1 / t.motion.dt) for t in problem.traces})
     cutoffs = sorted({round(t.cutoff, 1) for t in problem.traces})
     sentences = [
-        f"Torque and model were low-passed at {_listed(cutoffs)} Hz and compared at {_listed(rates)} Hz; physics with"
-        f" corners was evaluated at {1 / trace.dt:.0f} Hz and filtered like the torque.",
+        f"Torque and model were low-passed at {_listed(cutoffs)} Hz and compared at {_listed(rates)} Hz; physics"
+        f" with corners was evaluated at {1 / trace.dt:.0f} Hz and filtered like the torque.",
         f"The model's own numbers were taken as known as “{found.knowledge}” says: "
         + {
             "exact": "inertial parameters and friction as they stand.",

@@ -1,0 +1,159 @@
+"""What recordings could show, and the motion that would decide, against what simulated recordings then say.
+
+The arm is moved by MuJoCo's C engine, which shares no code with the analysis.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.interpolate
+
+from jaxpanda import Arm, Recording
+from jaxpanda.diagnosis.coverage import held_out_gains, least_shown
+from jaxpanda.diagnosis.decide import Finding
+from jaxpanda.diagnosis.diagnosis import pose
+from jaxpanda.diagnosis.next_motion import motions, next_motion
+from jaxpanda.diagnosis.problem import Problem
+from jaxpanda.diagnosis.search import ACCEPT, grids, with_terms
+from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.effects.friction import ViscousFriction
+from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.export import panda_mjcf
+from jaxpanda.simulation import FourierTrajectory, JointFriction, Sensors, random_trajectory, simulate
+
+JOINT, OFFSET = 5, 0.03
+SENSORS = Sensors(torque_noise=0.05, position_noise=1e-6)
+
+
+class Spline(FourierTrajectory):
+    """A tabled motion that the simulated arm can track."""
+
+    def __init__(self, time, q):
+        super().__init__(np.zeros((7, 1)), np.zeros((7, 1)), q[0], 2 * np.pi / time[-1])
+        object.__setattr__(self, "spline", scipy.interpolate.CubicSpline(time, q))
+
+    def __call__(self, time):
+        at = np.minimum(time, self.spline.x[-1])  # pyright: ignore
+        return tuple(self.spline(at, k) for k in range(3))  # pyright: ignore
+
+
+def record(trajectory, seed: int, seconds: float = 10.0) -> Recording:
+    friction = JointFriction(offset=OFFSET * np.eye(7)[JOINT])
+    return simulate(
+        panda_mjcf(),
+        trajectory,
+        duration=seconds,
+        rate=200,
+        friction=friction,
+        sensors=SENSORS,
+        seed=seed,
+        name=f"{seed}.csv",
+    )
+
+
+def posed(*recordings: Recording) -> tuple[Problem, np.ndarray]:
+    arm = Arm.panda()
+    traces = tuple(prepare(one, arm) for one in recordings)
+    return pose(traces, (True,) * len(traces), "exact")
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return random_trajectory(panda_mjcf(), 3, period=8.0)
+
+
+@pytest.fixture(scope="module")
+def known(recorded):
+    """A recording that shows a torque offset, and not that it is no asymmetric friction."""
+    problem, spread = posed(record(recorded, 0))
+    state = with_terms(problem, (problem.term(TorqueOffset(JOINT), np.array([0.05])),))
+    finding = Finding(
+        "torque_offset",
+        (JOINT,),
+        ("0.csv",),
+        None,
+        0.6,
+        (("asymmetric_friction", 0.4),),
+        "",
+        (),
+        np.zeros(7),
+        0.0,
+        "",
+        (0,),
+    )
+    return problem, spread, state, finding
+
+
+def margin(*recordings: Recording) -> float:
+    """Evidence of the offset over the best asymmetric friction at its joint [nats]."""
+    problem, _ = posed(*recordings)
+    noise = problem.noise(())
+    groups = [
+        g for g in problem.library if g.joint == JOINT and g.name in ("torque_offset", "asymmetric_friction")
+    ]
+    best = {p.effect.name: p.best for p in grids(problem, problem.design((), noise), noise, groups)}
+    return best["torque_offset"] - best["asymmetric_friction"]
+
+
+def test_the_recommended_motion_separates_what_the_recorded_one_does_not(known, recorded):
+    problem, spread, state, finding = known
+    motion = next_motion(problem, state, [finding], spread, "exact")
+    assert motion is not None
+    (told,) = motion.pairs
+    assert told.nats > 2 * told.nats_repeated
+    old = record(recorded, 0)
+    new = record(Spline(motion.time, motion.q), 1, float(motion.time[-1]))
+    before, repeated, after = margin(old), margin(old, record(recorded, 2)), margin(old, new)
+    assert before < 5
+    assert after - before > repeated - before + 3
+    assert after - before == pytest.approx(told.nats, rel=0.6)
+
+
+def test_motions_keep_to_limits_and_speeds_and_end_at_rest(known):
+    problem = known[0]
+    arm, trace = Arm.panda(), problem.traces[0]
+    fastest = 1.1 * np.abs(trace.motion.qd).max(0)
+    for kind, q in motions(problem, trace, [JOINT])[1:]:
+        assert len(q) == len(trace.channels.t)
+        qd = np.gradient(q, trace.dt, axis=0)
+        assert (q >= np.asarray(arm.lower)).all(), kind
+        assert (q <= np.asarray(arm.upper)).all(), kind
+        assert (np.abs(qd) <= 1.05 * np.maximum(fastest, 0.3)).all(), kind
+        assert np.abs(qd[[0, -1]]).max() < 0.05, kind
+
+
+def test_nothing_is_recommended_where_nothing_is_in_doubt(known):
+    problem, spread, state, finding = known
+    sure = dataclasses.replace(finding, alternatives=(("asymmetric_friction", 0.01),))
+    assert next_motion(problem, state, [sure], spread, "exact") is None
+
+
+def test_an_effect_of_the_size_that_would_have_shown_has_the_evidence_it_needs(known):
+    problem = known[0]
+    state = with_terms(problem, ())
+    (row,) = [r for r in least_shown(problem, state) if (r.effect, r.joint) == ("viscous_friction", 2)]
+    assert row.size is not None
+    noise, found = state.noise, {}
+    for share in (0.5, 1.0, 1.5):
+        trace = problem.traces[0]
+        assert trace.tau is not None
+        tau = trace.tau + share * row.size * trace.motion.qd[:, 2:3] * np.eye(7)[2]
+        planted = Problem((dataclasses.replace(trace, tau=tau),), (True,), problem.nuisance)
+        groups = [g for g in problem.library if isinstance(g.effects[0], ViscousFriction) and g.joint == 2]
+        (found[share],) = (p.evidence for p in grids(planted, planted.design((), noise), noise, groups))
+    assert found[0.5] < ACCEPT < found[1.5]
+    assert found[1.0] == pytest.approx(ACCEPT, abs=16)
+
+
+def test_gains_are_those_of_refitting_every_fold(known):
+    """One candidate added to a model, against the model with it fitted anew on every training block."""
+    problem, _, state, _ = known
+    noise, deviation = state.noise, np.array([0.05])
+    term = problem.term(TorqueOffset(JOINT), deviation)
+    nominal, whole = problem.design((), noise), problem.design((term,), noise)
+    columns = {JOINT: problem.whitened([c[:, JOINT] for c in term.columns], noise, JOINT)}
+    (gain,) = held_out_gains(problem, nominal, [columns], [deviation])
+    expected = 0.5 * (problem.held_out_error(nominal) - problem.held_out_error(whole))
+    assert gain.sum() == pytest.approx(expected, rel=1e-6)
+    assert gain.sum() > 10
