@@ -44,7 +44,7 @@ def record(trajectory, seed: int, seconds: float = 10.0) -> Recording:
         panda_mjcf(),
         trajectory,
         duration=seconds,
-        rate=200,
+        rate=200.0,
         friction=friction,
         sensors=SENSORS,
         seed=seed,
