@@ -531,7 +531,8 @@ def _heat_map(found: Diagnosis, names: Sequence[str]) -> Section:
         [
             "Gain of log likelihood [nats] on blocks of the recordings that the effect was not fitted to, in its"
             " best shape; negative where it makes them worse. What acts in the whole arm is split into the"
-            " joints' shares; what happens once (a contact, a change of payload) has no second block to be tested on."
+            " joints' shares; what happens once (a contact, a change of payload) has no second block to be tested"
+            " on."
         ],
         tables,
     )
