@@ -306,8 +306,8 @@ def _left(sums: _Sums, pair: _Pair) -> float:
     for C, u, G in zip(sums.C, sums.u, sums.G, strict=True):
         m, k, _ = G.shape
         b = (u - C.T @ x).reshape(m, k)
-        C = C.reshape(-1, m, k)
-        S = G - np.einsum("amk,aml->mkl", C, np.linalg.solve(H, C.reshape(len(H), -1)).reshape(C.shape))
+        C = C.reshape(len(H), m, k)
+        S = G - np.einsum("amk,aml->mkl", C, np.linalg.solve(H, C.reshape(len(H), m * k)).reshape(C.shape))
         S = S + 1e-9 * (np.trace(G, axis1=1, axis2=2)[:, None, None] / k + 1e-12) * np.eye(k)
         gained = np.einsum("mk,mk->m", b, np.linalg.solve(S, b[:, :, None])[:, :, 0])
         left = min(left, float(best - gained.max()))
