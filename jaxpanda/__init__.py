@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from .recordings import save as save
     from .retrieval import Retrieval as Retrieval
     from .retrieval import retrieve as retrieve
+    from .rollout import replay as replay
     from .signals import prepare as prepare
     from .simulation import simulate as simulate
     from .validation import validate as validate
@@ -53,6 +54,7 @@ _HOME = {
     "inspect": "inspection",
     "load": "recordings",
     "prepare": "signals",
+    "replay": "rollout",
     "retrieve": "retrieval",
     "save": "recordings",
     "simulate": "simulation",

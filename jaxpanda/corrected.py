@@ -4,24 +4,27 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxpanda_kernels import Chain, mass_matrix, rnea
+from jaxpanda_kernels import Chain
 from jaxtyping import Array, Float
 
 from .arm import Arm
 from .effects import (
     CATALOGUE,
     AbstractEffect,
-    AbstractInstantEffect,
     AbstractJointEffect,
-    AbstractMemoryEffect,
     Channels,
     Motion,
     joint_columns,
+    sign_over_velocity,
+    smooth_torque,
 )
 
 SCHEMA = "jaxpanda.corrected/1"
+FILE, XML = "corrected.json", "corrected.xml"
+"""Names that `diagnose` gives to the corrected arm and to the MJCF with what MuJoCo holds of it."""
 _ARM_FIELDS = ("standard", "armature", "damping", "frictionloss", "stiffness", "springref", "lower", "upper")
 
 
@@ -55,9 +58,9 @@ class Corrected(eqx.Module):
             if effect.bound_to_recording:
                 continue
             if hasattr(effect, "standard_change"):
-                link, more = effect.standard_change(np.asarray(c))  # pyright: ignore
+                link, more = effect.standard_change(c)  # pyright: ignore
                 standard = standard.at[link].add(more)
-            for attribute, value in effect.mjcf(np.asarray(c), self.arm).items():
+            for attribute, value in effect.mjcf(c, self.arm).items():
                 if attribute == "gravity":
                     gravity = jnp.asarray(value)
                     continue
@@ -85,37 +88,47 @@ class Corrected(eqx.Module):
     @property
     def beyond(self) -> tuple[tuple[AbstractEffect, Float[Array, " _n"]], ...]:
         """Effects that act on the plant and that MuJoCo's attributes do not hold, with their coefficients."""
+        return tuple((e, c) for e, c in self.acting(None) if e.acts_on == "plant")
+
+    def acting(
+        self, recording: str | None, later: bool | None = True
+    ) -> tuple[tuple[AbstractEffect, Float[Array, " _n"]], ...]:
+        """Effects beyond `native` that act in a recording, with their coefficients.
+
+        Args:
+            recording: its name; None for what is bound to none.
+            later: whether it was made after those that the effects were found in.
+        """
         out = []
         for effect, c in zip(self.effects, self.coefficients, strict=True):
-            held = hasattr(effect, "standard_change") or effect.mjcf(np.asarray(c), self.arm)
-            if not held and effect.acts_on == "plant" and not effect.bound_to_recording:
-                out.append((effect, c))
+            if effect.bound_to_recording:
+                here = None if recording is None else effect.placed(recording, later)
+            else:
+                native = hasattr(effect, "standard_change") or effect.mjcf(c, self.arm)
+                here = None if native else effect
+            if here is not None:
+                out.append((here, c))
         return tuple(out)
 
+    def plant(self, recording: str | None = None, later: bool | None = True) -> "Plant":
+        """The arm that moves, in a recording; `acting` explains the arguments."""
+        return Plant.of(self.native, self.arm, self.acting(recording, later))
+
     def start(self, q: Float[Array, " dof"], qd: Float[Array, " dof"]) -> tuple[Array, ...]:
-        """Hidden states of the effects with memory, for an arm at (q, qd)."""
-        s = self._instant(jnp.zeros(()), q, qd, jnp.zeros_like(q))
-        return tuple(e.start(s) for e, _ in self.beyond if isinstance(e, AbstractMemoryEffect))
+        """Hidden states of the effects on the plant, for an arm at (q, qd)."""
+        return self.plant().begin(jnp.zeros(()), q, qd, jnp.zeros_like(q))[0]
 
     def missing_torque(
         self, memory: tuple[Array, ...], t: Array, q: Array, qd: Array, qdd: Array, dt: float
     ) -> tuple[Float[Array, " dof"], tuple[Array, ...]]:
         """Torque [N m] that a motion takes beyond `native`, and the memory after a step of `dt` [s].
 
-        What a simulator applies is its negative (`qfrc_applied`).
+        What a simulator applies is its negative; `Plant.resist` splits it so that steep friction stays stable.
         """
-        s = self._instant(t, q, qd, qdd)
-        torque, states, left = jnp.zeros_like(q), [], list(memory)
-        for effect, c in self.beyond:
-            if isinstance(effect, AbstractMemoryEffect):
-                z, columns = effect.step(left.pop(0), s, dt)
-                states.append(z)
-            elif isinstance(effect, AbstractInstantEffect):
-                columns = effect.at(s)
-            else:
-                continue
-            torque = torque.at[effect.joint].add(columns @ c)
-        return torque, tuple(states)
+        native, plant = self.native, self.plant()
+        torque, damping, memory = plant.resist(memory, t, q, qd, qdd, dt)
+        held = (native.frictionloss - plant.arm.frictionloss) * jnp.sign(qd)
+        return torque + damping * qd - held, memory
 
     def inverse_dynamics(
         self,
@@ -127,11 +140,7 @@ class Corrected(eqx.Module):
         dt: float = 1e-3,
     ) -> Float[Array, " dof"]:
         """Torque [N m] of the plant in a motion, sensors' errors left out."""
-        memory = memory or self.start(q, qd)
-        return (
-            self.native.inverse_dynamics(q, qd, qdd)
-            + self.missing_torque(memory, jnp.asarray(t), q, qd, qdd, dt)[0]
-        )
+        return self.plant().inverse_dynamics(memory or self.start(q, qd), jnp.asarray(t), q, qd, qdd, dt)
 
     def forward_dynamics(
         self,
@@ -142,19 +151,13 @@ class Corrected(eqx.Module):
         memory: tuple[Array, ...] = (),
         dt: float = 1e-3,
     ) -> Float[Array, " dof"]:
-        """Acceleration [rad/s²]; friction that depends on load takes the load of the arm at no acceleration."""
-        memory = memory or self.start(q, qd)
-        arm, zero = self.native, jnp.zeros_like(q)
-        bias = (
-            arm.inverse_dynamics(q, qd, zero)
-            + self.missing_torque(memory, jnp.asarray(t), q, qd, zero, dt)[0]
-        )
-        M = mass_matrix(arm.chain, arm.standard, q) + jnp.diag(arm.armature)
-        return jnp.linalg.solve(M, tau - bias)
+        """Acceleration [rad/s²] under a torque: the inverse of `inverse_dynamics`, by Newton's method.
 
-    def _instant(self, t: Array, q: Array, qd: Array, qdd: Array) -> Channels:
-        load = rnea(self.arm.chain, self.arm.standard, q, qd, qdd)
-        return Channels(t, q, qd, qdd, load, load)
+        One step is exact unless friction depends on the load, which depends on the acceleration.
+        """
+        return self.plant().acceleration(
+            memory or self.start(q, qd), jnp.asarray(t), q, qd, tau, dt, jnp.zeros_like(q), iterations=4
+        )
 
     def measured_torque(
         self, motion: Motion, channels: Channels, held_sign: Float[np.ndarray, "time dof"]
@@ -223,6 +226,153 @@ class Corrected(eqx.Module):
             tuple(effects),
             tuple(jnp.asarray(e["coefficients"], float) for e in document["effects"]),
         )
+
+
+class Plant(eqx.Module):
+    r"""An arm as an engine's model can hold it, and the laws that act on it beyond.
+
+    $$\tau = \mathrm{ID}(q, \dot q, \ddot q) + r + d \circ \dot q$$
+
+    A law that is dry friction takes over the Coulomb friction that its joint has already: two laws of one sign
+    of velocity, one as an engine's constraint and one as a force, would hold the joint twice.
+    """
+
+    arm: Arm
+    """What the engine's model holds."""
+    nominal: Arm
+    """The user's arm, whose torque is the load of the effects that depend on it."""
+    laws: tuple[tuple[AbstractEffect, Float[Array, " _n"]], ...]
+    """Effects on the joints, with their coefficients."""
+    positions: tuple[tuple[AbstractEffect, Float[Array, " _n"]], ...]
+    """Effects between the joints and the position sensors."""
+    torques: tuple[tuple[AbstractEffect, Float[Array, " _n"]], ...]
+    """Effects of the torque sensors."""
+    level: Float[Array, " dof"]
+    """Coulomb friction that laws have taken over [N m]."""
+    width: Float[Array, " dof"]
+    """Velocity over which it changes sign [rad/s]."""
+
+    @classmethod
+    def of(
+        cls, native: Arm, nominal: Arm, acting: Sequence[tuple[AbstractEffect, Float[Array, " _n"]]]
+    ) -> "Plant":
+        """Sort effects by what they act on."""
+        sides = {"plant": [], "position": [], "torque": []}
+        for effect, c in acting:
+            sides[effect.acts_on].append((effect, c))
+        dry, width = np.zeros(native.dof, bool), jnp.full(native.dof, jnp.inf)
+        for effect, _ in sides["plant"]:
+            if effect.dry_width is not None:
+                dry[np.array(effect.joints)] = True
+                width = width.at[np.array(effect.joints)].min(effect.dry_width)
+        level, standard = jnp.where(dry, native.frictionloss, 0.0), native.standard
+        for effect, c in sides["plant"]:
+            if (carried := effect.carried(c)) is not None:
+                standard = standard.at[carried[0]].add(carried[1])
+        arm = eqx.tree_at(
+            lambda a: (a.frictionloss, a.standard), native, (native.frictionloss - level, standard)
+        )
+        laws, positions, torques = (tuple(side) for side in sides.values())
+        return cls(arm, nominal, laws, positions, torques, level, jnp.where(dry, width, 1.0))
+
+    def begin(self, t: Array, q: Array, qd: Array, tau: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Hidden states of `laws` and of `positions`, for an arm at (q, qd) that transmits `tau`."""
+        zero = jnp.zeros_like(q)
+        s, shown = self._channels(t, q, qd, zero), Channels(t, q, qd, zero, tau, tau)
+        return (
+            tuple(e.begin(c, self.nominal, s) for e, c in self.laws),
+            tuple(e.begin(c, self.nominal, shown) for e, c in self.positions),
+        )
+
+    def resist(
+        self, memory: tuple[Array, ...], t: Array, q: Array, qd: Array, qdd: Array, dt: float
+    ) -> tuple[Float[Array, " dof"], Float[Array, " dof"], tuple[Array, ...]]:
+        """What the laws do over a step of `dt` [s]: r [N m], d [N m s/rad], and their states after it.
+
+        d is never negative: dry friction that a law takes off is in d where there is as much, else in r.
+        """
+        s = self._channels(t, q, qd, qdd)
+        done = [e.resist(c, self.nominal, z, s, dt) for (e, c), z in zip(self.laws, memory, strict=True)]
+        torque = sum((d.torque for d in done), jnp.zeros_like(q))
+        damping = sum((d.damping for d in done), self.level * sign_over_velocity(qd, self.width))
+        torque = torque + jnp.minimum(damping, 0.0) * qd
+        return torque, jnp.maximum(damping, 0.0), tuple(d.state for d in done)
+
+    def inverse_dynamics(
+        self, memory: tuple[Array, ...], t: Array, q: Array, qd: Array, qdd: Array, dt: float
+    ) -> Float[Array, " dof"]:
+        """Torque [N m] of a motion."""
+        torque, damping, _ = self.resist(memory, t, q, qd, qdd, dt)
+        return self.arm.inverse_dynamics(q, qd, qdd) + torque + damping * qd
+
+    def acceleration(
+        self,
+        memory: tuple[Array, ...],
+        t: Array,
+        q: Array,
+        qd: Array,
+        tau: Array,
+        dt: float,
+        guess: Array,
+        *,
+        iterations: int = 1,
+        implicit: bool = False,
+    ) -> Float[Array, " dof"]:
+        """Acceleration [rad/s²] under a torque, by Newton's method.
+
+        Args:
+            memory: states of the laws.
+            t: [s].
+            q: [rad].
+            qd: [rad/s].
+            tau: [N m].
+            dt: time step of the laws [s].
+            guess: where to start; matters only where a law depends on the load.
+            iterations: of Newton's method; one is exact where the laws are linear in the acceleration.
+            implicit: take damping at the velocity after the step, as an engine does.
+        """
+
+        def left(qdd):
+            torque, damping, _ = self.resist(memory, t, q, qd, qdd, dt)
+            later = (damping + self.arm.damping) * dt * qdd if implicit else 0.0
+            return self.arm.inverse_dynamics(q, qd, qdd) + torque + damping * qd + later - tau
+
+        qdd = guess
+        for _ in range(iterations):
+            qdd = qdd - jnp.linalg.solve(jax.jacfwd(left)(qdd), left(qdd))
+        return qdd
+
+    def shift(
+        self, memory: tuple[Array, ...], t: Array, q: Array, qd: Array, tau: Array, dt: float
+    ) -> tuple[Float[Array, " dof"], tuple[Array, ...]]:
+        """How much more than q the position sensors show [rad] of an arm that transmits `tau`."""
+        s = Channels(t, q, qd, jnp.zeros_like(q), tau, tau)
+        total, states = jnp.zeros_like(q), []
+        for (effect, c), z in zip(self.positions, memory, strict=True):
+            ahead, z = effect.shift(c, self.nominal, z, s, dt)
+            total = total + ahead
+            states.append(z)
+        return total, tuple(states)
+
+    def sensed(self, t: Float[Array, " time"], tau: Float[Array, "time dof"]) -> Float[Array, "time dof"]:
+        """What the torque sensors show over a roll-out [N m]."""
+        for effect, c in self.torques:
+            tau = effect.sensed(c, t, tau)
+        return tau
+
+    def true(self, t: Float[Array, " time"], tau: Float[Array, "time dof"]) -> Float[Array, "time dof"]:
+        """The torque behind what the sensors show [N m]."""
+        for effect, c in reversed(self.torques):
+            tau = effect.true(c, t, tau)
+        return tau
+
+    def feels(self, what: str) -> bool:
+        """Whether a law depends on that: "load" (or acceleration), "acceleration"."""
+        return any(e.feels in (what, "acceleration") for e, _ in self.laws)
+
+    def _channels(self, t: Array, q: Array, qd: Array, qdd: Array) -> Channels:
+        load = smooth_torque(self.nominal, q, qd, qdd) if self.feels("load") else jnp.zeros_like(q)
+        return Channels(t, q, qd, qdd, load, load)
 
 
 def effect_from_json(document: Mapping[str, Any]) -> AbstractEffect:

@@ -189,7 +189,7 @@ def validate(
     if not motions:
         raise InputError(f"{model}: nothing to validate against; give at least one recording")
     bare = arm_model(source)
-    mjx, notes = _mjx(source.model)
+    mjx, notes = mjx_package(source.model)
     notes = [*source.notes, *notes]
 
     states = _states(motions)
@@ -418,7 +418,7 @@ def _smooth(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def _mjx(model: mujoco.MjModel) -> tuple[Any, list[str]]:
+def mjx_package(model: mujoco.MjModel) -> tuple[Any, list[str]]:
     """The MJX package, or a note why the model cannot be checked in it."""
     try:
         with contextlib.redirect_stdout(None):  # it prints which backends it has not got
@@ -432,7 +432,7 @@ def _mjx(model: mujoco.MjModel) -> tuple[Any, list[str]]:
     return mjx, []
 
 
-def _jit_mjx(function: Callable[..., Any]) -> Callable[..., Any]:
+def jit_mjx(function: Callable[..., Any]) -> Callable[..., Any]:
     """`jax.jit`; on a CPU with LLVM at level 1: 17 times as fast for MJX's step of a Panda as at level 3."""
     options = {"xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
     return jax.jit(function, compiler_options=options)
@@ -442,7 +442,7 @@ def _mjx_inverse(mjx: Any, bare: mujoco.MjModel, q, qd, qdd) -> Float[np.ndarray
     model = mjx.put_model(_smooth(bare))
     blank = mjx.make_data(model)
 
-    @_jit_mjx
+    @jit_mjx
     @jax.vmap
     def torque(q, qd, qdd):
         return mjx.inverse(model, blank.replace(qpos=q, qvel=qd, qacc=qdd)).qfrc_inverse
@@ -546,7 +546,7 @@ def _rollout_mjx(mjx: Any, bare: mujoco.MjModel, tasks: Sequence[_Task], law: _F
         applied = tau + added - law.resistance(data.qvel)
         return mjx.step(model, data.replace(qfrc_applied=applied)), (data.qpos, added)
 
-    @_jit_mjx
+    @jit_mjx
     def run(q, qd, tau):
         return jax.lax.scan(step, blank.replace(qpos=q[0], qvel=qd[0]), (q, qd, tau))[1]
 

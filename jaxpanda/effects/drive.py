@@ -11,7 +11,7 @@ from jaxpanda_kernels import mass_matrix
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape
+from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Numbers, Shape
 from .motion import Channels, Joint, Motion
 from .twist import Law, low_passed, twist_torque
 
@@ -44,7 +44,7 @@ class Armature(AbstractInstantEffect):
     def at(self, s: Channels) -> Float[Array, " n"]:
         return s.qdd[self.joint][None]
 
-    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+    def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         return {"armature": {int(self.joint): c[0]}}
 
 
@@ -93,7 +93,7 @@ class JointSpring(AbstractInstantEffect):
         one = jnp.ones_like(q)
         return jnp.stack({"linear": [q, one], "centred": [q], "cubic": [q, one, q**2, q**3]}[self.form])
 
-    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+    def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         if self.form == "cubic" or arm.stiffness[int(self.joint)] != 0:
             return {}
         j = int(self.joint)

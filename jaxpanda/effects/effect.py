@@ -23,6 +23,9 @@ from jaxtyping import Array, Float
 from ..arm import Arm
 from .motion import Channels, Motion
 
+Numbers = Float[Array, " n"] | Float[np.ndarray, " n"]
+"""Coefficients, which may be traced."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Coefficient:
@@ -128,7 +131,7 @@ class AbstractEffect(eqx.Module):
             out.append({"name": shape.name, "joint": joint, "value": value, "std": None, "unit": shape.unit})
         return out
 
-    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+    def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         """Changes that reproduce the effect in MuJoCo natively, by joint attribute; empty if none can."""
         return {}
 
@@ -138,9 +141,17 @@ class AbstractEffect(eqx.Module):
         return None
 
     @property
-    def feels_load(self) -> bool:
-        """Whether its torque depends on acceleration or load, which a simulator has to solve for."""
-        return False
+    def feels(self) -> Literal["motion", "load", "acceleration"]:
+        """What its torque follows besides position, velocity and time. A simulator takes the load of the step
+        before, but solves for the acceleration: torque in its proportion is inertia, and bears no lag."""
+        return "motion"
+
+    def carried(self, c: Numbers) -> tuple[int, Float[Array, "10"]] | None:
+        """Link, and the body on it that a simulator's model holds throughout; `resist` takes it off meanwhile.
+
+        Taking off inertia by the acceleration of the step before is stable; adding it is not.
+        """
+        return None
 
     def begin(self, c: Float[Array, " n"], arm: Arm, s: Channels) -> Float[Array, " states"]:
         """Hidden state of `resist` or `shift` at the first instant."""
@@ -151,7 +162,7 @@ class AbstractEffect(eqx.Module):
     ) -> Resistance:
         """What it does to the joints over a step of `dt` [s] of a simulation; `arm` is the nominal one.
 
-        `s.load` is the torque of the nominal rigid arm at this instant's acceleration.
+        `s.load` is the torque of the nominal rigid arm at the acceleration `s.qdd`.
         """
         raise NotImplementedError(f"{self.name} acts on the {self.acts_on} sensors")
 

@@ -1,15 +1,14 @@
 """Friction without memory: of velocity, of load, of time."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractDryFriction, AbstractInstantEffect, Coefficient, Shape, smooth_sign
+from .effect import AbstractDryFriction, AbstractInstantEffect, Coefficient, Numbers, Shape, smooth_sign
 from .motion import Channels, Joint
 
 _WIDTH = Shape("v0", "rad/s", 1e-3, 0.3)
@@ -43,7 +42,7 @@ class ViscousFriction(AbstractInstantEffect):
     def at(self, s: Channels) -> Float[Array, " n"]:
         return s.qd[self.joint][None]
 
-    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+    def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         return {"damping": {int(self.joint): c[0]}}
 
 
@@ -77,7 +76,7 @@ class CoulombFriction(AbstractDryFriction):
     def levels(self, s: Channels) -> Float[Array, " n"]:
         return jnp.ones(1)
 
-    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+    def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         return {"frictionloss": {int(self.joint): c[0]}}
 
 
@@ -266,8 +265,8 @@ class LoadDependentFriction(AbstractDryFriction):
         return f"tau = ({level}load_coefficient * |tau_load|^exponent) * tanh(dq / v0)"
 
     @property
-    def feels_load(self) -> bool:
-        return True
+    def feels(self) -> Literal["motion", "load", "acceleration"]:
+        return "load"
 
     def levels(self, s: Channels) -> Float[Array, " n"]:
         loaded = (jnp.abs(s.load[self.joint]) + 1e-9) ** self.exponent

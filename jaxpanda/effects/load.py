@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxpanda_kernels import rnea
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractArmEffect, Coefficient, Resistance, Shape
+from .effect import AbstractArmEffect, Coefficient, Numbers, Resistance, Shape
 from .motion import Motion
 
 _MOMENTS = ("first_moment_x", "first_moment_y", "first_moment_z")
@@ -105,7 +105,7 @@ class InertialParameters(AbstractArmEffect):
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         return motion.regressor[:, :, 10 * self.link : 10 * self.link + 10] @ self._basis[0]
 
-    def standard_change(self, c: Float[np.ndarray, " n"]) -> tuple[int, Float[np.ndarray, "10"]]:
+    def standard_change(self, c: Numbers) -> tuple[int, Float[Array, "10"] | Float[np.ndarray, "10"]]:
         """Link, and what is added to its standard parameters."""
         return self.link, self._basis[0] @ c
 
@@ -151,7 +151,7 @@ class Payload(AbstractArmEffect):
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         return motion.regressor[:, :, 10 * self.link : 10 * self.link + 10] @ self._basis[0]
 
-    def standard_change(self, c: Float[np.ndarray, " n"]) -> tuple[int, Float[np.ndarray, "10"]]:
+    def standard_change(self, c: Numbers) -> tuple[int, Float[Array, "10"] | Float[np.ndarray, "10"]]:
         """Link, and what is added to its standard parameters."""
         return self.link, self._basis[0] @ c
 
@@ -211,14 +211,18 @@ class PayloadChange(AbstractArmEffect):
         return columns * window(motion.time, float(self.start), float(self.stop), motion.dt)[:, None, None]
 
     @property
-    def feels_load(self) -> bool:
-        return True
+    def feels(self) -> Literal["motion", "load", "acceleration"]:
+        return "load"
+
+    def carried(self, c: Numbers) -> tuple[int, Float[Array, "10"]] | None:
+        return self.link, jnp.asarray(self._basis[0] @ c)
 
     def resist(self, c, arm, z, s, dt):
+        """The body taken off while it is not there."""
         phi = jnp.zeros_like(arm.standard).at[self.link].set(self._basis[0] @ c)
         q, qd, qdd = (jnp.asarray(x) for x in (s.q, s.qd, s.qdd))
-        torque = rnea(arm.chain, phi, q, qd, qdd) * window(s.t, self.start, self.stop, dt)
-        return Resistance(torque, jnp.zeros_like(s.q), z)
+        gone = window(s.t, self.start, self.stop, dt) - 1
+        return Resistance(rnea(arm.chain, phi, q, qd, qdd) * gone, jnp.zeros_like(q), z)
 
     def parameters(self, c, covariance) -> list[dict[str, Any]]:
         joint = self.joints[0] + 1
@@ -272,11 +276,11 @@ class GravityDirection(AbstractArmEffect):
     def parameters(self, c, covariance):
         return [{**p, "joint": None} for p in super().parameters(c, covariance)]
 
-    def gravity_change(self, c: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
+    def gravity_change(self, c: Numbers) -> Float[Array, "3"] | Float[np.ndarray, "3"]:
         """What is added to the gravity vector [m/s²]."""
         return c @ np.array(self.across)
 
-    def mjcf(self, c: Float[np.ndarray, " n"], arm: Arm) -> Mapping[str, Any]:
+    def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         return {"gravity": np.asarray(arm.chain.gravity) + self.gravity_change(c)}
 
 

@@ -127,14 +127,15 @@ class Motion:
         return np.concatenate(out)
 
 
-def _smooth(arm: Arm, q: Array, qd: Array, qdd: Array) -> Array:
+def smooth_torque(arm: Arm, q: Array, qd: Array, qdd: Array) -> Array:
+    """`Motion.load` at one instant [N m]."""
     rigid = rnea(arm.chain, arm.standard, q, qd, qdd)
     return rigid + arm.armature * qdd + arm.stiffness * (q - arm.springref)
 
 
 @jax.jit
 def _smooth_torque(arm, q, qd, qdd):
-    return jax.vmap(lambda *s: _smooth(arm, *s))(q, qd, qdd)
+    return jax.vmap(lambda *s: smooth_torque(arm, *s))(q, qd, qdd)
 
 
 @jax.jit
@@ -155,7 +156,7 @@ def _gravity_columns(arm, q):
 @jax.jit
 def _sensitivity(arm, q, qd, qdd, dq, dqd, dqdd):
     def one(q, qd, qdd, dq, dqd, dqdd):
-        return jax.jvp(lambda *s: _smooth(arm, *s), (q, qd, qdd), (dq, dqd, dqdd))[1]
+        return jax.jvp(lambda *s: smooth_torque(arm, *s), (q, qd, qdd), (dq, dqd, dqdd))[1]
 
     return jax.vmap(one)(q, qd, qdd, dq, dqd, dqdd)
 

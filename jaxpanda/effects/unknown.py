@@ -1,7 +1,7 @@
 """What no named effect explains: a free function of one channel, so that it is still located and fitted."""
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -75,8 +75,10 @@ class Unknown(AbstractInstantEffect):
         return _WIDTH if self._odd and self.form != "odd in dq_k" else None
 
     @property
-    def feels_load(self) -> bool:
-        return self.form in ("of load", "friction of load", "of ddq")
+    def feels(self) -> Literal["motion", "load", "acceleration"]:
+        if self.form == "of ddq":
+            return "acceleration"
+        return "load" if self.form.endswith("load") else "motion"
 
     def _hats(self, s: Channels) -> Float[Array, " n"]:
         """Share of each knot."""
