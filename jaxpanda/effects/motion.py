@@ -165,7 +165,7 @@ def _sensitivity(arm, q, qd, qdd, dq, dqd, dqdd):
 def _slopes(arm, q, qd, qdd):
     def one(q, qd, qdd):
         def along(e):
-            return jax.jvp(lambda q: _smooth(arm, q, qd, qdd), (q,), (e,))[1] @ e
+            return jax.jvp(lambda q: smooth_torque(arm, q, qd, qdd), (q,), (e,))[1] @ e
 
         return jax.vmap(along)(jnp.eye(q.shape[0]))
 
