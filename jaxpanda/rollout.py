@@ -55,13 +55,13 @@ Engine = Literal["mujoco", "mjx"]
 
 
 class Task(eqx.Module):
-    """A recorded motion on the simulator's time steps, and the torque that its sensors showed."""
+    """A recorded motion on the simulator's time steps, or one step of it, and the torque behind what was measured."""
 
-    time: Float[Array, " steps"]
+    time: Float[Array, "*steps"]
     """By the recording's clock [s]."""
-    q: Float[Array, "steps dof"]
-    qd: Float[Array, "steps dof"]
-    tau: Float[Array, "steps dof"]
+    q: Float[Array, "*steps dof"]
+    qd: Float[Array, "*steps dof"]
+    tau: Float[Array, "*steps dof"]
 
 
 class Gains(eqx.Module):
