@@ -55,7 +55,7 @@ Engine = Literal["mujoco", "mjx"]
 
 
 class Task(eqx.Module):
-    """A recorded motion on the simulator's time steps, or one step of it, and the torque behind what was measured."""
+    """A recorded motion on the simulator's time steps, or one step of it; the torque is the true one."""
 
     time: Float[Array, "*steps"]
     """By the recording's clock [s]."""
