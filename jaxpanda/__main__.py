@@ -121,12 +121,17 @@ class Retrieve:
     """The arm (MJCF) that bounds are set around when it is not the Panda and --bounds is absent."""
     weighting: Literal["none", "torque"] = "none"
     """All coefficients alike, as the paper has it, or each direction by the torque it moved."""
+    processes: str = ""
+    """Share the starts with other processes, here or on other machines: RANK/COUNT@HOST:PORT in each of them,
+    with ranks from 0 and HOST:PORT free on the machine of rank 0; or `auto` where a launcher such as Slurm says
+    it. Every process spreads its share over all its devices; rank 0 alone writes and prints."""
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
-        from . import pipeline
+        from . import pipeline, session
 
+        session.join(self.processes)
         return pipeline.retrieve_files(
             self.out,
             self.identification,
@@ -265,6 +270,8 @@ def main(arguments: list[str] | None = None) -> int:
 
         session.start()
         result = command.run()
+        if result is None:  # another process has it
+            return 0
         if command.json:
             from .files import to_json
 
@@ -276,8 +283,8 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"jaxpanda: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("jaxpanda: interrupted; nothing was left half-written", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"jaxpanda: interrupted; {str(stop) or 'nothing was left half-written'}", file=sys.stderr)
         return 1
     return 0
 

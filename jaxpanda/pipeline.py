@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,7 +20,7 @@ from .inspection import Inspection, inspect
 from .lint import lint
 from .mjcf import from_document, from_mjcf
 from .recordings import Recording, load_many
-from .retrieval import Retrieval, retrieve
+from .retrieval import CHECKPOINT_FILE, Retrieval, retrieve
 from .session import progress
 from .validation import Validation, validate
 
@@ -103,20 +104,45 @@ def retrieve_files(
     weighting: Literal["none", "torque"],
     starts: int,
     seed: int,
-) -> Retrieval:
-    """`jaxpanda retrieve`."""
+) -> Retrieval | None:
+    """`jaxpanda retrieve`, on all devices; with several processes, the first alone has something to return.
+
+    Starts are kept in `out` as they finish, until the result is there: the same command goes on from them.
+    """
     arm = None if model is None else Arm.from_mjcf(model)
+    options: dict[str, Any] = {
+        "bounds": bounds,
+        "arm": arm,
+        "weighting": weighting,
+        "starts": starts,
+        "seed": seed,
+        "devices": jax.devices(),
+    }
+    if jax.process_index() > 0:
+        retrieve(identification, **options)
+        return None
+    checkpoint, done = out / CHECKPOINT_FILE, 0
+
+    def count(finished: int, total: int) -> None:
+        nonlocal done
+        done = finished
+        tick(finished, total)
+
     with output_folder(out) as folder, progress("random starts") as tick:
-        links = retrieve(
-            identification,
-            bounds=bounds,
-            arm=arm,
-            weighting=weighting,
-            starts=starts,
-            seed=seed,
-            progress=tick,
-        )
-        links.save(folder)
+        try:
+            links = retrieve(identification, **options, checkpoint=checkpoint, progress=count)
+            links.save(folder)
+        except KeyboardInterrupt:
+            if not done:
+                checkpoint.unlink(missing_ok=True)
+                raise
+            said = f"{done} of {starts} starts are kept in {checkpoint}; the same command goes on from there"
+            raise KeyboardInterrupt(said) from None
+        except InputError:
+            if done == starts:  # of these starts nothing can be made
+                checkpoint.unlink(missing_ok=True)
+            raise
+    checkpoint.unlink(missing_ok=True)
     return links
 
 

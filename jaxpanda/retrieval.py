@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,13 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import inertia
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .arm import Arm
 from .certificate import lower_bound
 from .errors import InputError
 from .feasible import Bounds, Constraint, Links, Solutions, exact_penalty, solve
 from .feasible.bounds import INERTIA
+from .feasible.schedule import Device
 from .feasible.solver import STARTS
 from .files import finite, output_folder, read_json, to_json
 from .friction import Friction
@@ -29,12 +31,14 @@ from .parameters import coefficient_matrix
 SCHEMA = "jaxpanda.retrieval/1"
 FILE = "retrieval.json"
 STARTS_FILE = "starts.npz"
+CHECKPOINT_FILE = "starts.partial"
 AS_GOOD = 1.01
 """A solution is as good as the best where its objective is within this factor of it."""
 CONCESSION = 5e-4
 """Share of the objective that may be given up to stay near the nominal parameters."""
 ACTIVE = 1e-5
 """A constraint is active where its margin is below this share of its box (triangle inequality: [kg m²])."""
+_BLOCK = 16384  # starts described at once
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,9 +121,9 @@ class Retrieval:
         """Write `retrieval.json`, and every start's outcome as `starts.npz`; both or neither."""
         with output_folder(folder) as scratch:
             (scratch / FILE).write_text(to_json(self.to_json()), "utf-8")
-            if self.solutions is not None:
-                arrays = dataclasses.asdict(self.solutions)
-                np.savez_compressed(scratch / STARTS_FILE, **arrays)
+            if self.solutions is not None:  # as it is: random numbers do not compress
+                names = [field.name for field in dataclasses.fields(self.solutions)]
+                np.savez(scratch / STARTS_FILE, **{name: getattr(self.solutions, name) for name in names})
         return Path(folder) / FILE
 
     @classmethod
@@ -175,6 +179,8 @@ def retrieve(
     starts: int = STARTS,
     seed: int = 0,
     certificate: bool | Literal["auto"] = "auto",
+    devices: Sequence[Device] | None = None,
+    checkpoint: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Retrieval:
     r"""Feasible parameters of the links behind identified coefficients (Gaz et al. 2019, section IV).
@@ -198,17 +204,21 @@ def retrieve(
         starts: random starts.
         seed: same seed, same answer.
         certificate: lower bound by convex optimisation; "auto" where the extra [sdp] is installed.
+        devices: over which the starts are spread, with the same answer: all of this process when None;
+            `jax.devices()` where several processes (`jax.distributed.initialize`) make this same call.
+        checkpoint: file that keeps the starts as they finish, so that an interrupted run goes on where it was
+            ("smooth" penalty only). Remove it when the result is saved.
         progress: called with (starts done, starts).
 
     Raises:
-        InputError: malformed table or bounds, or no start ends feasible.
+        InputError: malformed table or bounds, no start ends feasible, or a checkpoint of another run.
         MissingExtraError: `certificate=True` without the extra [sdp].
     """
     table = _identified(identification)
     boxes = _bounds(bounds, arm, table)
     A, b = _equations(table, boxes.dof, weighting)
     constraints = tuple(constraints)
-    run = {"smooth": solve, "exact": exact_penalty}[penalty]
+    run = {"smooth": partial(solve, devices=devices, checkpoint=checkpoint), "exact": exact_penalty}[penalty]
     found = run(A, b, boxes, constraints=constraints, starts=starts, seed=seed, progress=progress)
     feasible = found.violation == 0
     if not feasible.any() and penalty == "smooth":
@@ -233,7 +243,7 @@ def retrieve(
         max_violation=violation,
         margins=margins,
         active=tuple(_active(margins, boxes)),
-        spread=_spread(found.phi[as_good]),
+        spread=_spread(found.phi, as_good),
         as_good=int(as_good.sum()),
         starts=starts,
         seed=seed,
@@ -263,7 +273,7 @@ def _bounds(bounds: Bounds | str | Path | None, arm: Arm | None, table: Identifi
     if bounds is None:
         if arm is not None:
             chosen = Bounds.around(arm)
-        elif table.arm in ("", "panda") and table.dof <= 7:
+        elif table.arm in ("", "panda"):
             chosen = Bounds.panda()
         else:
             raise InputError(
@@ -272,7 +282,8 @@ def _bounds(bounds: Bounds | str | Path | None, arm: Arm | None, table: Identifi
     else:
         chosen = bounds if isinstance(bounds, Bounds) else Bounds.from_csv(bounds)
     if chosen.dof < table.dof:
-        raise InputError(f"bounds: cover {chosen.dof} links, the coefficients name link {table.dof}")
+        whose = "of the Panda, taken as no others were given, " if bounds is None and arm is None else ""
+        raise InputError(f"bounds: {whose}cover {chosen.dof} links, the coefficients name link {table.dof}")
     return chosen
 
 
@@ -352,7 +363,17 @@ def _described(
     return mass.reshape(shape), com.reshape(*shape, 3), six.reshape(*shape, 6)
 
 
-def _spread(phi: Float[np.ndarray, "starts dof 10"]) -> dict[str, tuple[float, float]]:
+def _spread(
+    phi: Float[np.ndarray, "starts dof 10"], chosen: Bool[np.ndarray, " starts"]
+) -> dict[str, tuple[float, float]]:
+    """Over the chosen starts, in blocks, which bounds the memory."""
+    numbers = np.flatnonzero(chosen)
+    blocks = [_extremes(phi[numbers[i : i + _BLOCK]]) for i in range(0, len(numbers), _BLOCK)]
+    low = {name: min(block[name][0] for block in blocks) for name in blocks[0]}
+    return {name: (low[name], max(block[name][1] for block in blocks)) for name in low}
+
+
+def _extremes(phi: Float[np.ndarray, "starts dof 10"]) -> dict[str, tuple[float, float]]:
     mass, com, six = _described(phi)
     columns = {}
     for i in range(phi.shape[1]):

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +16,10 @@ from rich.progress import (
     SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
+    TimeRemainingColumn,
 )
+
+from .errors import InputError
 
 
 def start() -> None:
@@ -30,6 +34,32 @@ def start() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
+def join(processes: str) -> None:
+    """Make this one of several processes that share their devices (`jax.distributed`).
+
+    Args:
+        processes: `RANK/COUNT@HOST:PORT`; "auto" where the cluster's launcher says it; "" for a process alone.
+
+    Raises:
+        InputError: malformed, or the others were not found.
+    """
+    if not processes:
+        return
+    found = re.fullmatch(r"(\d+)/(\d+)@(.+:\d+)", processes)
+    if processes != "auto" and (found is None or not int(found[1]) < int(found[2])):
+        raise InputError(
+            f"--processes {processes}: expected RANK/COUNT@HOST:PORT with RANK from 0 to COUNT - 1, such as "
+            "0/2@192.168.0.1:12345, or auto"
+        )
+    try:
+        if found is None:
+            jax.distributed.initialize()
+        else:
+            jax.distributed.initialize(found[3], int(found[2]), int(found[1]))
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"--processes {processes}: the others were not found ({error})") from None
+
+
 Tick = Callable[[int, int], None]
 """Called with (done, total) as a stage goes on."""
 
@@ -40,7 +70,14 @@ def progress(what: str) -> Iterator[Tick]:
     if not sys.stderr.isatty():
         yield lambda done, total: None
         return
-    columns = (SpinnerColumn(), TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        SpinnerColumn(),
+        TextColumn(what),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)

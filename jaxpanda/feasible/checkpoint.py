@@ -14,7 +14,6 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +40,32 @@ class Checkpoint:
         self.path = Path(path)
         self.identity = dict(identity)
 
+    def require_same(self) -> None:
+        """Refuse a file of another run before any work is done.
+
+        Raises:
+            InputError: the file is of another run, or is no checkpoint.
+        """
+        if not self.path.exists():
+            return
+        with self.path.open("rb") as file:
+            line = file.readline(1 << 20)
+        try:
+            found = json.loads(line)
+            theirs = found["identity"]
+            if found["schema"] != SCHEMA or not isinstance(theirs, dict):
+                raise ValueError(found["schema"])
+        except (ValueError, KeyError, TypeError):
+            raise InputError(
+                f"{self.path}: is no checkpoint of starts; move it away, or choose another --out"
+            ) from None
+        differing = [name for name, value in self.identity.items() if theirs.get(name) != value]
+        if differing:
+            raise InputError(
+                f"{self.path}: holds finished starts of another run (other {', '.join(differing)}); "
+                "repeat that run to finish it, or remove the file"
+            )
+
     def restore(self, outcome: tuple[np.ndarray, ...]) -> int:
         """Copy the finished starts, without gap from the first on, into `outcome`; how many those are.
 
@@ -48,12 +73,9 @@ class Checkpoint:
 
         Args:
             outcome: arrays with a row a start, as the blocks hold them; filled in place.
-
-        Raises:
-            InputError: the file is of another run, or is no checkpoint.
         """
         self._row = np.dtype([(f"{i}", one.dtype, one.shape[1:]) for i, one in enumerate(outcome)])
-        header = {"schema": SCHEMA, "row": str(self._row), "identity": self.identity}
+        header = {"schema": SCHEMA, "identity": self.identity}
         if not self.path.exists():
             part = self.path.with_name(f".{self.path.name}.part")
             part.write_bytes(json.dumps(header).encode() + b"\n")
@@ -61,7 +83,7 @@ class Checkpoint:
             return 0
         size, done = self.path.stat().st_size, 0
         with self.path.open("r+b") as file:
-            self._require_same(file.readline(1 << 20), header)
+            file.readline()
             whole = file.tell()
             while len(start := file.read(_BLOCK.size)) == _BLOCK.size:
                 first, count, checksum = _BLOCK.unpack(start)
@@ -90,23 +112,6 @@ class Checkpoint:
         """The run is over and its result saved."""
         self.path.unlink(missing_ok=True)
 
-    def _require_same(self, line: bytes, expected: Mapping[str, Any]) -> None:
-        try:
-            found = json.loads(line)
-            theirs = found["identity"]
-            if found["schema"] != SCHEMA or not isinstance(theirs, dict):
-                raise ValueError(found["schema"])
-        except (ValueError, KeyError, TypeError):
-            raise InputError(
-                f"{self.path}: is no checkpoint of starts; move it away, or choose another --out"
-            ) from None
-        if found != expected:
-            differing = [name for name, value in self.identity.items() if theirs.get(name) != value]
-            raise InputError(
-                f"{self.path}: holds finished starts of another run (other "
-                f"{', '.join(differing) or 'layout'}); repeat that run to finish it, or remove the file"
-            )
-
 
 def identity(
     A: np.ndarray,
@@ -115,7 +120,7 @@ def identity(
     constraints: Sequence[Constraint],
     extra: tuple[np.ndarray | None, ...],
     seed: int,
-    settings: tuple[int, ...],
+    settings: tuple[float, ...],
 ) -> dict[str, str]:
     """What a start's outcome depends on, by name: the numbers as digests, programs by their source."""
     here = Path(__file__).parent

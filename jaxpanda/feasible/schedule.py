@@ -55,6 +55,8 @@ def run(
         checkpoint: kept by process 0; starts found in it are not solved again.
         progress: called with (starts done, starts) as chunks finish.
     """
+    if checkpoint is not None and jax.process_index() == 0:
+        checkpoint.require_same()
     chunk = min(chunk, starts)
     mesh = _mesh(devices, -(-starts // chunk))
     shared = mesh.is_multi_process
