@@ -131,6 +131,7 @@ class Retrieve:
     def run(self) -> Any:
         from . import pipeline, session
 
+        session.spread_over_cores()
         session.join(self.processes)
         return pipeline.retrieve_files(
             self.out,

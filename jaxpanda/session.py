@@ -34,6 +34,20 @@ def start() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
+def spread_over_cores() -> None:
+    """Make every processor core a device, so that starts keep all of them busy; before any array is made.
+
+    jaxlib's batched LAPACK waits for its pool of threads inside that pool, and everything hangs once every thread
+    of it waits. As many again as there are devices keep it going; XLA reads their number from `NPROC`.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    forced = re.search(r"xla_force_host_platform_device_count=(\d+)", os.environ.get("XLA_FLAGS", ""))
+    devices = int(forced[1]) if forced else cores
+    os.environ.setdefault("NPROC", str(2 * max(devices, cores)))
+    if not forced:
+        jax.config.update("jax_num_cpu_devices", devices)
+
+
 def join(processes: str) -> None:
     """Make this one of several processes that share their devices (`jax.distributed`).
 

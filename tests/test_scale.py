@@ -189,7 +189,8 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_finishes_it(table, tmp_p
 
 def environment(**changes: str) -> dict[str, str]:
     root = Path(__file__).parents[1]
-    paths = os.pathsep.join([str(root), str(root / "kernels"), str(root / "tests")])
+    own = [str(root), str(root / "kernels"), str(root / "tests")]
+    paths = os.pathsep.join([*own, *filter(None, [os.environ.get("PYTHONPATH")])])
     return os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"} | changes
 
 
