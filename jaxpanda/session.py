@@ -35,7 +35,9 @@ def start() -> None:
 
 
 def spread_over_cores() -> None:
-    """Make every processor core a device, so that starts keep all of them busy; before any array is made.
+    """Make every processor core a device, so that many starts keep all of them busy; before any array is made.
+
+    Where arrays were made already, nothing changes.
 
     jaxlib's batched LAPACK waits for its pool of threads inside that pool, and everything hangs once every thread
     of it waits. As many again as there are devices keep it going; XLA reads their number from `NPROC`.
@@ -43,9 +45,10 @@ def spread_over_cores() -> None:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     forced = re.search(r"xla_force_host_platform_device_count=(\d+)", os.environ.get("XLA_FLAGS", ""))
     devices = int(forced[1]) if forced else cores
-    os.environ.setdefault("NPROC", str(2 * max(devices, cores)))
-    if not forced:
-        jax.config.update("jax_num_cpu_devices", devices)
+    with contextlib.suppress(RuntimeError):
+        if not forced:
+            jax.config.update("jax_num_cpu_devices", devices)
+        os.environ.setdefault("NPROC", str(2 * max(devices, cores)))
 
 
 def join(processes: str) -> None:
@@ -72,6 +75,10 @@ def join(processes: str) -> None:
             jax.distributed.initialize(found[3], int(found[2]), int(found[1]))
     except (ValueError, RuntimeError) as error:
         raise InputError(f"--processes {processes}: the others were not found ({error})") from None
+    # What connects the processes reports that to file 1, where --json allows one document and nothing else.
+    sys.stdout.flush()
+    sys.stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
 
 
 Tick = Callable[[int, int], None]

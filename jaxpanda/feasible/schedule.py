@@ -1,21 +1,23 @@
 """Starts in chunks: spread over devices and machines, fetched as they finish, kept in a checkpoint.
 
-Every device solves chunks of one size with one program, so a start's answer has the same bits on one device as on
-many, wherever a run was interrupted. Lanes never exchange anything: the program is mapped over the devices
-(`jax.shard_map`), each of which goes at its own pace.
+Every device solves chunks of one size with one and the same program for a single device. So a start's answer has
+the same bits on one device as on many, and wherever a run was interrupted. A program partitioned over a mesh
+(`jax.shard_map`) would not give that: XLA fuses it otherwise, and where coefficients leave directions open,
+rounding moves an answer along them by 1e-4 at the same objective.
 """
 
 import collections
 import functools
 import time
 from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import SingleDeviceSharding
 from jaxtyping import Array, Int, PyTree
 
 from .checkpoint import Checkpoint
@@ -26,8 +28,7 @@ Chunk = Callable[..., PyTree[Array]]
 Device = Any
 """A `jax.Device`, which type checkers do not know."""
 
-_ROWS = PartitionSpec("starts")
-_EVERYWHERE = PartitionSpec()
+_WORTH = 8  # chunks a further CPU device must get: it shares the cores, and compiling for it costs as much
 
 
 def run(
@@ -58,37 +59,55 @@ def run(
     if checkpoint is not None and jax.process_index() == 0:
         checkpoint.require_same()
     chunk = min(chunk, starts)
-    mesh = _mesh(devices, -(-starts // chunk))
-    shared = mesh.is_multi_process
+    devices = list(jax.local_devices() if devices is None else devices)
+    mine = [device for device in devices if device.process_index == jax.process_index()]
+    processes = collections.Counter(device.process_index for device in devices)
+    shared = len(processes) > 1
+    on_cpu = devices[0].platform == "cpu"
+    if not shared:
+        worth = -(-starts // chunk) // (_WORTH if on_cpu else 1)
+        mine = mine[: max(1, worth)]
+    share = max(processes.values()) if shared else len(mine)  # chunks of a process at a time
     began = time.perf_counter()
     leaves, structure = jax.tree.flatten(problem)
-    leaves = tuple(_placed(np.asarray(leaf), NamedSharding(mesh, _EVERYWHERE)) for leaf in leaves)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-    program, like = _compiled(solve, options, structure, shapes, chunk, mesh)
+    programs, like = _compiled(solve, options, structure, shapes, chunk, tuple(mine))
+    placed = [jax.device_put(leaves, device) for device in mine]
     compiled = time.perf_counter()
     outcome = tuple(np.empty((starts, *one.shape[1:]), one.dtype) for one in jax.tree.leaves(like))
     done = _taken_up(checkpoint, outcome, shared)
     if progress is not None and done:
         progress(done, starts)
 
-    def finish(first: int, pending: PyTree[Array]) -> None:
-        fetched = (
-            multihost_utils.process_allgather(pending, tiled=True) if shared else jax.device_get(pending)
-        )
+    def begin(first: int) -> list[list[Array]]:
+        """This process's chunks from this start on."""
+        first += (jax.process_index() if shared else 0) * share * chunk
+        chunks = []
+        for k in range(share):
+            numbers = np.minimum(np.arange(chunk) + first + k * chunk, starts - 1)
+            device = k % len(mine)
+            chunks.append(
+                jax.tree.leaves(programs[device](placed[device], jax.device_put(numbers, mine[device])))
+            )
+        return chunks
+
+    def finish(first: int, chunks: list[list[Array]]) -> None:
+        parts = [np.concatenate(part) for part in zip(*jax.device_get(chunks), strict=True)]
+        if shared:
+            parts = multihost_utils.process_allgather(parts, tiled=True)
         last = min(first + wave, starts)
-        for whole, part in zip(outcome, jax.tree.leaves(fetched), strict=True):
+        for whole, part in zip(outcome, parts, strict=True):
             whole[first:last] = part[: last - first]
         if checkpoint is not None and jax.process_index() == 0:
             checkpoint.append(first, tuple(whole[first:last] for whole in outcome))
         if progress is not None:
             progress(last, starts)
 
-    wave = chunk * mesh.size
-    ahead = 0 if mesh.devices.flat[0].platform == "cpu" else 1  # chunks under way while one is fetched
-    under_way: collections.deque[tuple[int, PyTree[Array]]] = collections.deque()
+    wave = share * chunk * len(processes)
+    ahead = 0 if on_cpu else 1  # waves under way while one is fetched
+    under_way: collections.deque[tuple[int, list[list[Array]]]] = collections.deque()
     for first in range(done, starts, wave):
-        numbers = np.minimum(np.arange(first, first + wave), starts - 1)
-        under_way.append((first, program(leaves, _placed(numbers, NamedSharding(mesh, _ROWS)))))
+        under_way.append((first, begin(first)))
         if len(under_way) > ahead:
             finish(*under_way.popleft())
     while under_way:
@@ -100,21 +119,6 @@ def run(
     )
 
 
-def _mesh(devices: Sequence[Device] | None, chunks: int) -> Mesh:
-    """No more devices than chunks, unless they belong to several processes, which all must take part."""
-    devices = list(jax.local_devices() if devices is None else devices)
-    mesh = Mesh(np.array(devices), ("starts",))
-    return (
-        mesh
-        if mesh.is_multi_process or chunks >= len(devices)
-        else Mesh(np.array(devices[:chunks]), ("starts",))
-    )
-
-
-def _placed(x: np.ndarray, sharding: NamedSharding) -> Array:
-    return jax.make_array_from_callback(x.shape, sharding, lambda index: x[index])
-
-
 @functools.lru_cache(maxsize=16)
 def _compiled(
     solve: Chunk,
@@ -122,21 +126,26 @@ def _compiled(
     structure: Any,
     shapes: tuple[tuple[tuple[int, ...], Any], ...],
     chunk: int,
-    mesh: Mesh,
-) -> tuple[Callable[..., PyTree[Array]], PyTree[jax.ShapeDtypeStruct]]:
+    devices: tuple[Device, ...],
+) -> tuple[list[Callable[..., PyTree[Array]]], PyTree[jax.ShapeDtypeStruct]]:
     """The program for a chunk on each device; kept, because cross-validation solves one shape many times."""
 
-    def of_device(leaves: tuple[Array, ...], numbers: Int[Array, " chunk"]) -> PyTree[Array]:
+    def of_chunk(leaves: list[Array], numbers: Int[Array, " chunk"]) -> PyTree[Array]:
         return solve(jax.tree.unflatten(structure, leaves), numbers, *options)
 
-    mapped = jax.shard_map(
-        of_device, mesh=mesh, in_specs=(_EVERYWHERE, _ROWS), out_specs=_ROWS, check_vma=False
-    )
-    shaped = lambda shape, dtype, spec: jax.ShapeDtypeStruct(shape, dtype, sharding=NamedSharding(mesh, spec))
-    leaves = tuple(shaped(shape, dtype, _EVERYWHERE) for shape, dtype in shapes)
-    numbers = shaped((chunk * mesh.size,), jnp.asarray(0).dtype, _ROWS)
-    lowered = jax.jit(mapped).lower(leaves, numbers)
-    return lowered.compile(), lowered.out_info
+    jitted = jax.jit(of_chunk)
+
+    def lowered(device: Device) -> Any:
+        where = SingleDeviceSharding(device)
+        shaped = lambda shape, dtype: jax.ShapeDtypeStruct(shape, dtype, sharding=where)
+        leaves = [shaped(shape, dtype) for shape, dtype in shapes]
+        return jitted.lower(leaves, shaped((chunk,), jnp.asarray(0).dtype))
+
+    each = [lowered(device) for device in devices]
+    first = each[0].compile()  # where there is a compilation cache, it has the GPU's program from here on
+    with ThreadPoolExecutor(len(devices)) as pool:
+        others = list(pool.map(lambda one: one.compile(), each[1:]))
+    return [first, *others], each[0].out_info
 
 
 def _taken_up(checkpoint: Checkpoint | None, outcome: tuple[np.ndarray, ...], shared: bool) -> int:
@@ -146,6 +155,6 @@ def _taken_up(checkpoint: Checkpoint | None, outcome: tuple[np.ndarray, ...], sh
         done = checkpoint.restore(outcome)
     if shared:
         done = int(multihost_utils.broadcast_one_to_all(np.asarray(done)))
-        for whole in outcome:
+        for whole in outcome if done else ():
             whole[:done] = multihost_utils.broadcast_one_to_all(whole[:done])
     return done
