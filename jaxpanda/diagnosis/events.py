@@ -5,14 +5,13 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 import scipy.linalg
-import scipy.special
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import TorqueRipple
 from ..effects.load import PayloadChange
-from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
+from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes, log_mean_exp
 from .problem import Problem
 
 BIN = 0.1
@@ -54,20 +53,20 @@ def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]
         )  # one turn and a half, lest it be a spring
         if not len(orders):
             continue
-        Phi, G = problem.prepared(
-            ("ripple",),
+        b, G = problem.projected(
+            "ripple",
             lambda q=q, orders=orders: [
                 np.stack([np.sin(x[:, None] * orders), np.cos(x[:, None] * orders)], 2) * on
                 for x, on in zip(q, problem.active, strict=True)
             ],
             noise,
+            design,
             j,
         )
-        b, G = design.in_joint(j, Phi, G)
         deviation = np.full((len(orders), 2), noise.std[j] * np.sqrt(2))
         score, scale = log_bayes(b, G, deviation, SCALES)
         top = int(score.argmax())
-        evidence = float(scipy.special.logsumexp(score) - np.log(len(score)))
+        evidence = float(log_mean_exp(score))
         yield Proposal(
             TorqueRipple(j, float(orders[top]), "one"),
             evidence,
@@ -79,7 +78,6 @@ def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]
 
 def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal]:
     """For each link and recording the likeliest window of a contact, and the likeliest change of payload."""
-    L = None if design.factor is None else design.factor[0]
     first = np.cumsum([0, *(t.motion.samples for t in problem.traces)])
     for r, (trace, on) in enumerate(zip(problem.traces, problem.active, strict=True)):
         if not on:
@@ -87,27 +85,6 @@ def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal
         bins = max(2, round(BIN / trace.motion.dt))
         edges = np.arange(0, trace.motion.samples, bins)
         clock = trace.motion.time[edges]
-        rows = slice(first[r], first[r + 1])
-        left = [(res - A @ design.x)[rows] for res, A in zip(design.residual, design.columns, strict=True)]
-        nuisance = [A[rows] for A in design.columns]
-
-        def sums(columns, joints, trace=trace, left=left, nuisance=nuisance, edges=edges):
-            n = columns.shape[2]
-            G, b = np.zeros((len(edges), n, n)), np.zeros((len(edges), n))
-            C = np.zeros((len(edges), nuisance[0].shape[1], n))
-            for j in joints:
-                F = noise.whiten(columns[:, j], j) * trace.weight[:, None]
-                G += np.add.reduceat(np.einsum("ta,tb->tab", F, F), edges)
-                b += np.add.reduceat(F * left[j][:, None], edges)
-                parts = np.split(np.arange(len(F)), edges[1:])
-                C += np.stack([nuisance[j][p].T @ F[p] for p in parts])
-            if L is not None:
-                flat = np.moveaxis(C, 1, 0).reshape(C.shape[1], -1)
-                C = np.moveaxis(
-                    scipy.linalg.solve_triangular(L, flat, lower=True).reshape(-1, len(edges), n), 1, 0
-                )
-            return tuple(np.concatenate([np.zeros((1, *x.shape[1:])), np.cumsum(x, 0)]) for x in (b, G, C))
-
         count = len(edges)
         pairs = np.array(
             [
@@ -118,25 +95,79 @@ def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal
             ]
         )  # fmt: skip
         stops = np.append(clock, trace.motion.time[-1] + trace.motion.dt)
-        for link in range(problem.dof) if len(pairs) else ():
-            effect = ExternalContact(link, 0.0, 1.0, trace.name, "base")
-            columns = trace.motion.wrench_columns[:, link]
-            b, G = _window_sums(sums(columns, range(link + 1)), pairs)
-            yield _event(effect, b, G, stops, pairs)
+        contact = [ExternalContact(i, 0.0, 1.0, trace.name, "base") for i in range(problem.dof)]
+        change = PayloadChange(problem.dof - 1, 0.0, 1.0, trace.name, "gained")
+        always = dataclasses.replace(change, start=-1e9, stop=1e9)
+        parts = [
+            _binned(problem, design, noise, r, slice(first[r], first[r + 1]), bins, j, always)
+            for j in range(problem.dof)
+        ]
+        b, G, H, C = (_cumulated(np.sum([p[k] for p in parts], 0)) for k in range(4))
+        if design.factor is not None:
+            flat = np.swapaxes(C, 0, 1).reshape(C.shape[1], -1)
+            flat = scipy.linalg.solve_triangular(design.factor[0], flat, lower=True, check_finite=False)
+            C = np.swapaxes(flat.reshape(C.shape[1], len(C), -1), 0, 1)
+        n = 6 * problem.dof  # of the contacts; the rest is the payload
+        if len(pairs):
+            found = [
+                _window_sums((b[:, k], G[:, i], C[:, :, k]), pairs)
+                for i, k in enumerate(np.arange(n).reshape(-1, 6))
+            ]
+            yield from _events(contact, found, stops, pairs)
         switches = np.arange(_EDGE, count - _EDGE)
         gained = np.stack([switches, np.full_like(switches, count)], 1)
         lost = np.stack([np.zeros_like(switches), switches], 1)
-        change = PayloadChange(problem.dof - 1, 0.0, 1.0, trace.name, "gained")
-        forever = np.array([-1e9, 1e9])
-        total = sums(
-            dataclasses.replace(change, start=forever[0], stop=forever[1]).over(trace.motion),
-            range(problem.dof),
-        )
         for form, spans in (("gained", gained), ("lost", lost)):
             if len(spans):
-                b, G = _window_sums(total, spans)
-                proposal = _event(dataclasses.replace(change, form=form), b, G, stops, spans)
-                yield proposal
+                sums = _window_sums((b[:, n:], H, C[:, :, n:]), spans)
+                yield from _events([dataclasses.replace(change, form=form)], [sums], stops, spans)
+
+
+def _cumulated(x: Float[np.ndarray, "bins ..."]) -> Float[np.ndarray, "edges ..."]:
+    return np.concatenate([np.zeros((1, *x.shape[1:])), np.cumsum(x, 0)])
+
+
+def _binned(
+    problem: Problem,
+    design: Design,
+    noise: Noise,
+    r: int,
+    rows: slice,
+    bins: int,
+    joint: int,
+    payload: PayloadChange,
+) -> tuple[np.ndarray, ...]:
+    r"""What a joint adds, bin by bin of a recording, to $\Phi^\top r$, to the Gram matrices of the contacts and
+    of the payload, and to $A^\top \Phi$. What depends on the joint's noise alone is kept."""
+    here, trace = problem.whitened_joint(noise, joint, design.terms), problem.traces[r]
+
+    def split(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([x, np.zeros((-len(x) % bins, *x.shape[1:]))]).reshape(-1, bins, *x.shape[1:])
+
+    def with_model(A: np.ndarray, F: np.ndarray) -> np.ndarray:
+        return np.swapaxes(split(A[rows]), 1, 2) @ F
+
+    if ("windows", r) not in here.blocks:
+        contacts = trace.motion.wrench_columns[:, :, joint].reshape(trace.motion.samples, -1)
+        F = noise.whiten(np.concatenate([contacts, payload.over(trace.motion)[:, joint]], 1), joint)
+        F = split(F * trace.weight[:, None])
+        apart = F[:, :, : contacts.shape[1]].reshape(*F.shape[:2], -1, 6).swapaxes(1, 2)
+        whole = F[:, :, contacts.shape[1] :]
+        grams = apart.swapaxes(2, 3) @ apart, whole.swapaxes(1, 2) @ whole
+        here.blocks["windows", r] = F, {"grams": grams, "nuisance": with_model(here.nuisance, F)}
+    F, kept = here.blocks["windows", r]
+    C = np.zeros((len(F), len(design.g), F.shape[2]))
+    place = here.nuisance.shape[1]
+    C[:, :place] = kept["nuisance"]
+    for term in design.terms:
+        width, A = len(term.deviation), here.terms[id(term)][1]
+        if A is not None:
+            if id(term) not in kept:
+                kept[id(term)] = with_model(A, F)
+            C[:, place : place + width] = kept[id(term)]
+        place += width
+    b = np.einsum("ts,tsk->tk", split(design.left[joint][rows]), F)
+    return b, *kept["grams"], C
 
 
 def _window_sums(sums, pairs):
@@ -144,17 +175,22 @@ def _window_sums(sums, pairs):
     return b, G - np.matmul(np.swapaxes(C, 1, 2), C)
 
 
-def _event(effect, b, G, clock, pairs) -> Proposal:
-    coefficients = effect.coefficients
+def _events(effects, found, clock, pairs) -> Iterator[Proposal]:
+    """For each effect of one kind the likeliest window, from b and G in each window."""
+    coefficients = effects[0].coefficients
+    b, G = (np.concatenate([f[k] for f in found]) for k in (0, 1))
     deviation = np.tile([k.scale for k in coefficients], (len(b), 1))
     signs = np.array([float(k.sign) for k in coefficients])
     n = b.shape[1]
     G = 0.5 * (G + np.swapaxes(G, 1, 2)) + 1e-9 * np.eye(n) / deviation[:1, :, None] ** 2
-    score, scale = log_bayes(b, G, deviation, PHYSICAL_SCALES, signs)
-    top = int(score.argmax())
-    evidence = float(scipy.special.logsumexp(score) - np.log(len(score)))
-    start, stop = float(clock[pairs[top, 0]]), float(clock[pairs[top, 1]])
-    if isinstance(effect, PayloadChange):
-        start, stop = (start, 1e9) if effect.form == "gained" else (-1e9, stop)
-    placed = dataclasses.replace(effect, start=start, stop=stop)
-    return Proposal(placed, evidence, float(score[top]), deviation[top] * scale[top], (BIN, BIN))
+    scores, scales = log_bayes(b, G, deviation, PHYSICAL_SCALES, signs)
+    for effect, score, scale in zip(
+        effects, *(np.split(x, len(effects)) for x in (scores, scales)), strict=True
+    ):
+        top = int(score.argmax())
+        start, stop = float(clock[pairs[top, 0]]), float(clock[pairs[top, 1]])
+        if isinstance(effect, PayloadChange):
+            start, stop = (start, 1e9) if effect.form == "gained" else (-1e9, stop)
+        placed = dataclasses.replace(effect, start=start, stop=stop)
+        evidence = float(log_mean_exp(score))
+        yield Proposal(placed, evidence, float(score[top]), deviation[0] * scale[top], (BIN, BIN))

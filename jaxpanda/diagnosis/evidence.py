@@ -13,7 +13,9 @@ forward regression, and Bayesian model selection.
 """
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -47,6 +49,21 @@ class Noise:
         return y
 
 
+class OnDemand(Sequence):
+    """Arrays that are made when they are asked for."""
+
+    def __init__(self, make: Callable[[int], np.ndarray], count: int):
+        self.make, self.count = functools.cache(make), count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: Any) -> Any:
+        if not 0 <= index < self.count:
+            raise IndexError(index)
+        return self.make(int(index))
+
+
 class Design:
     """What is in the model already: whitened columns for each joint, and their prior."""
 
@@ -55,16 +72,33 @@ class Design:
         columns: Sequence[Float[np.ndarray, "rows n"]],
         residual: Sequence[Float[np.ndarray, " rows"]],
         precision: Float[np.ndarray, " n"],
+        normal: tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]] | None = None,
+        terms: Sequence[Any] = (),
     ):
-        self.columns, self.residual, self.precision = columns, residual, precision
-        H = np.diag(precision).astype(float)
-        g = np.zeros(len(precision))
-        for A, r in zip(columns, residual, strict=True):
-            H += A.T @ A
-            g += A.T @ r
-        self.factor = scipy.linalg.cho_factor(H, lower=True) if len(g) else None
-        self.g = g
-        self.x = self.solve(g)
+        """`normal` holds $A^\\top A$ and $A^\\top r$ where they are known; `terms` made the last columns."""
+        self.columns, self.residual, self.precision, self.terms = columns, residual, precision, tuple(terms)
+        if normal is None:
+            pairs = list(zip(columns, residual, strict=True))
+            normal = np.asarray(sum(A.T @ A for A, _ in pairs)), np.asarray(sum(A.T @ r for A, r in pairs))
+        self.normal = normal
+        self.information, self.g = normal[0] + np.diag(precision), normal[1]
+        self.factor = scipy.linalg.cho_factor(self.information, lower=True) if len(self.g) else None
+        self.x = self.solve(self.g)
+
+    def without(self, i: int) -> "Design":
+        """The model less one of its terms."""
+        first = len(self.precision) - sum(len(t.deviation) for t in self.terms[i:])
+        kept = np.ones(len(self.precision), bool)
+        kept[first : first + len(self.terms[i].deviation)] = False
+        normal = self.normal[0][np.ix_(kept, kept)], self.normal[1][kept]
+        columns = OnDemand(lambda joint: self.columns[joint][:, kept], len(self.columns))
+        others = (*self.terms[:i], *self.terms[i + 1 :])
+        return Design(columns, self.residual, self.precision[kept], normal, others)
+
+    @functools.cached_property
+    def left(self) -> list[Float[np.ndarray, " rows"]]:
+        """What the model leaves of each joint's residual."""
+        return [r - A @ self.x for r, A in zip(self.residual, self.columns, strict=True)]
 
     def solve(self, y: np.ndarray) -> np.ndarray:
         """$H^{-1} y$."""
@@ -89,7 +123,7 @@ class Design:
         """b and G of m candidates that act in one joint, given their Gram matrices."""
         rows, m, n = Phi.shape
         flat = Phi.reshape(rows, m * n)
-        b = (flat.T @ (self.residual[joint] - self.columns[joint] @ self.x)).reshape(m, n)
+        b = (flat.T @ self.left[joint]).reshape(m, n)
         if self.factor is not None:
             C = scipy.linalg.solve_triangular(self.factor[0], self.columns[joint].T @ flat, lower=True)
             G = G - gram(C.reshape(-1, m, n))
@@ -101,11 +135,11 @@ class Design:
         """b and G of m candidates that act in all joints, given their Gram matrices in each."""
         _, m, n = Phi[0].shape
         b, G, C = np.zeros((m, n)), np.zeros((m, n, n)), np.zeros((len(self.g), m * n))
-        for A, r, F, Q in zip(self.columns, self.residual, Phi, grams, strict=True):
+        for A, left, F, Q in zip(self.columns, self.left, Phi, grams, strict=True):
             if not Q.any():
                 continue
             flat = F.reshape(len(F), m * n)
-            b += (flat.T @ (r - A @ self.x)).reshape(m, n)
+            b += (flat.T @ left).reshape(m, n)
             G += Q
             C += A.T @ flat
         if self.factor is not None:
@@ -125,7 +159,7 @@ def log_bayes(
     G: Float[np.ndarray, "m n n"],
     deviation: Float[np.ndarray, "m n"],
     scales: Sequence[float],
-    signs: Float[np.ndarray, " n"] | None = None,
+    signs: Float[np.ndarray, "*_m n"] | None = None,
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Log Bayes factor of each candidate, averaged over the scales, and the scale that is likeliest.
 
@@ -136,19 +170,53 @@ def log_bayes(
         scales: multiples of it.
         signs: where a coefficient cannot be negative (1) or positive (-1): its half-normal prior counts.
     """
-    n = b.shape[1]
-    out = np.empty((len(scales), len(b)))
-    for i, scale in enumerate(scales):
-        D = scale * deviation
-        B = D[:, :, None] * G * D[:, None, :] + np.eye(n)
-        Db = D * b
-        L = np.linalg.cholesky(B)
-        y = np.linalg.solve(L, Db[..., None])[..., 0]
-        out[i] = 0.5 * (y**2).sum(1) - np.log(np.diagonal(L, axis1=1, axis2=2)).sum(1)
-        if signs is not None and np.any(signs):
-            inverse = np.linalg.inv(B)
-            mean = np.einsum("mab,mb->ma", inverse, Db)
-            spread = np.sqrt(np.maximum(np.diagonal(inverse, axis1=1, axis2=2), 1e-300))
-            allowed = scipy.special.log_ndtr(signs * mean / spread) + np.log(2.0)
-            out[i] += np.where(signs != 0, allowed, 0.0).sum(1)
-    return scipy.special.logsumexp(out, axis=0) - np.log(len(scales)), np.asarray(scales)[out.argmax(0)]
+    m, n = b.shape
+    s = np.asarray(scales, float)[:, None]
+    D = [deviation[:, k] for k in range(n)]
+    Db = [s * (D[k] * b[:, k]) for k in range(n)]
+    B = [[s**2 * (D[i] * G[:, i, k] * D[k]) + (i == k) for k in range(i + 1)] for i in range(n)]
+    L = _cholesky(B)
+    y = _forward(L, Db)
+    out = sum((0.5 * y[k] ** 2 - np.log(L[k][k]) for k in range(n)), np.zeros((len(scales), m)))
+    if signs is not None and np.any(signs):
+        wide = np.broadcast_to(signs, (m, n))
+        for k in np.flatnonzero(np.any(wide != 0, 0)):
+            column = _forward(L, [np.full_like(out, float(i == k)) for i in range(n)], int(k))
+            spread = np.sqrt(sum(c**2 for c in column[k:]))
+            mean = sum(c * v for c, v in zip(column[k:], y[k:], strict=True))
+            allowed = scipy.special.log_ndtr(wide[:, k] * mean / spread) + np.log(2.0)
+            out += np.where(wide[:, k] != 0, allowed, 0.0)
+    return log_mean_exp(out), np.asarray(scales)[out.argmax(0)]
+
+
+def log_mean_exp(x: Float[np.ndarray, "n ..."]) -> Any:
+    """$\\log \\langle e^x \\rangle$ over the first axis."""
+    top = x.max(0)
+    return top + np.log(np.exp(x - top).mean(0))
+
+
+Rows = list[list[np.ndarray]]
+"""A lower triangle, each entry an array over candidates: small matrices are fastest side by side."""
+
+
+def _cholesky(B: Rows) -> Rows:
+    """The factor L of many matrices $B = 1 + S$ with S positive: no pivot is below one but by rounding."""
+    L: Rows = []
+    for i, row in enumerate(B):
+        L.append([])
+        for k, entry in enumerate(row):
+            for l in range(k):
+                entry = entry - L[i][l] * L[k][l]
+            L[i].append(np.sqrt(np.maximum(entry, 1.0)) if i == k else entry / L[k][k])
+    return L
+
+
+def _forward(L: Rows, b: Sequence[np.ndarray], first: int = 0) -> list[np.ndarray]:
+    """$L^{-1} b$, where b is zero before `first`."""
+    y = list(b[:first])
+    for i in range(first, len(b)):
+        value = b[i]
+        for l in range(first, i):
+            value = value - L[i][l] * y[l]
+        y.append(value / L[i][i])
+    return y

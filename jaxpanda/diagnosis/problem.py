@@ -6,16 +6,20 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+import scipy.linalg
+from jaxtyping import Bool, Float
 
 from .. import signals as signals_
 from ..effects import AbstractEffect, AbstractJointEffect
 from . import catchall
-from .evidence import Design, Noise, gram
+from .evidence import Design, Noise, OnDemand
 from .library import Candidates, build, columns_of
-from .noise import estimate, saturated_residual, strongest_order
+from .noise import autoregression, saturated_residual, strongest_order
+from .scan import Block, Family, Score, Whitened, families, parallel, projected, scan
 from .traces import Trace
 
+_MEMORY = 1 << 28
+"""Bytes of columns of shapes off the grid that are kept."""
 FOLDS = 5
 """Blocks of the cross-validation."""
 
@@ -91,6 +95,39 @@ class Problem:
             out.append(wide)
         return out
 
+    @functools.cached_property
+    def _evaluated(self) -> dict[tuple, list[np.ndarray]]:
+        """Columns of shapes met before: a search tries many again."""
+        known = {}
+        for group in (*self.library, *self.catchalls):
+            for i, effect in enumerate(group.effects):
+                known[key_of(effect)] = [c[..., i, :] for c in group.columns]
+        return known
+
+    def columns(self, effects: Sequence[AbstractEffect]) -> list[Float[np.ndarray, "_time ..."]]:
+        """Columns of shapes of one form at one place in all recordings, as `columns_of`."""
+        known = {key: self._evaluated[key] for e in effects if (key := key_of(e)) in self._evaluated}
+        new = [e for e in effects if key_of(e) not in known]
+        if new:
+            columns = []
+            for r, trace in enumerate(self.traces):
+                here = self.placed(new, r)
+                columns.append(columns_of(here, trace) if here else 0.0 * columns_of(new, trace))
+            if sum(c.nbytes for kept in self._later.values() for c in kept) > _MEMORY:
+                for key in self._later:
+                    del self._evaluated[key]
+                self._later.clear()
+            fresh = {key_of(effect): [c[..., i, :] for c in columns] for i, effect in enumerate(new)}
+            self._later.update(fresh)
+            self._evaluated.update(fresh)
+            known.update(fresh)
+        each = [known[key_of(e)] for e in effects]
+        return [np.stack([c[r] for c in each], -2) for r in range(len(self.traces))]
+
+    @functools.cached_property
+    def _later(self) -> dict[tuple, list[np.ndarray]]:
+        return {}
+
     def placed(self, effects: Sequence[AbstractEffect], r: int) -> list[AbstractEffect]:
         """What of shapes of one form acts in a recording; empty if nothing does."""
         if not self.active[r]:
@@ -109,36 +146,97 @@ class Problem:
         return np.concatenate(parts)
 
     @functools.cached_property
+    def families(self) -> list[Family]:
+        """Library and free forms as the scan takes them."""
+        return families([*self.library, *self.catchalls], self.dof)
+
+    @functools.cached_property
     def _cache(self) -> dict:
+        """For what a search wants to keep."""
         return {}
 
-    def prepared(self, key: tuple, make: Any, noise: Noise, joint: int) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened columns `(rows, m, n)` in a joint and their Gram matrices, kept while the joint's noise stays.
+    @functools.cached_property
+    def _scanned(self) -> list:
+        return []
+
+    def scan(self, design: Design, noise: Noise) -> dict[int, Score]:
+        """`scan.scan`; that of the last design is kept."""
+        if not self._scanned or self._scanned[0] is not design or self._scanned[1] is not noise:
+            self._scanned[:] = design, noise, scan(self, design, noise)
+        return self._scanned[2]
+
+    @functools.cached_property
+    def _joints(self) -> dict[int, Whitened]:
+        return {}
+
+    def whitened_joint(self, noise: Noise, joint: int, terms: Sequence[Term] = ()) -> Whitened:
+        """Residual, nuisance and terms in a joint, whitened; kept while the joint's noise stays."""
+        stamp = noise.a[joint].tobytes(), float(noise.sigma[joint])
+        here = self._joints.get(joint)
+        if here is None or here.stamp != stamp:
+            residual = self.whitened([r[:, joint] for r in self.residual], noise, joint)
+            nuisance = self.whitened([n[:, joint] for n in self.nuisance], noise, joint)
+            here = self._joints[joint] = Whitened(stamp, residual, nuisance)
+        for term in terms:
+            if id(term) not in here.terms:
+                columns = [c[:, joint] for c in term.columns]
+                acts = any(np.any(c) for c in columns)
+                here.terms[id(term)] = term, self.whitened(columns, noise, joint) if acts else None
+        return here
+
+    def whitened_joints(self, noise: Noise, terms: Sequence[Term]) -> list[Whitened]:
+        """`whitened_joint` of all."""
+        return [self.whitened_joint(noise, j, terms) for j in range(self.dof)]
+
+    @functools.cached_property
+    def _repeated(self) -> dict[Any, Block]:
+        return {}
+
+    def projected(
+        self, key: Any, make: Any, noise: Noise, design: Design, joint: int
+    ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n n"]]:
+        """b and G (its lower triangle) of candidates in one joint that come again.
 
         Args:
             key: names the columns.
             make: gives them for each recording, `(time, m, n)`.
             noise: to whiten by.
+            design: what the model holds.
             joint: where.
         """
-        stamp = noise.a[joint].tobytes(), float(noise.sigma[joint])
-        kept = self._cache.get((key, joint))
-        if kept is None or kept[0] != stamp:
-            Phi = self.whitened(make(), noise, joint)
-            kept = self._cache[key, joint] = (stamp, Phi, gram(Phi))
-        return kept[1], kept[2]
+        if (key, joint) not in self._repeated:
+            x = np.swapaxes(np.concatenate(make()), 1, 2)
+            flat = np.ascontiguousarray(x).reshape(len(x), -1)
+            self._repeated[key, joint] = Block(key, joint, x.shape[1], flat)
+        return projected(self, noise, design, [self._repeated[key, joint]])
 
     def design(self, terms: Sequence[Term], noise: Noise) -> Design:
         """The model with these terms, whitened."""
-        columns = [
-            np.concatenate([n, *(t.columns[r] for t in terms)], 2) for r, n in enumerate(self.nuisance)
-        ]
-        precision = np.concatenate([np.ones(self.nuisance[0].shape[2]), *(t.deviation**-2.0 for t in terms)])
-        return Design(
-            [self.whitened([c[:, j] for c in columns], noise, j) for j in range(self.dof)],
-            [self.whitened([r[:, j] for r in self.residual], noise, j) for j in range(self.dof)],
-            precision,
-        )
+        counts = [self.nuisance[0].shape[2], *(len(t.deviation) for t in terms)]
+        ends = np.cumsum([0, *counts])
+        place = {
+            key: slice(ends[i], ends[i + 1]) for i, key in enumerate(["nuisance", *(id(t) for t in terms)])
+        }
+        H, g = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
+        joints = self.whitened_joints(noise, terms)
+        for here in joints:
+            acting = ["nuisance", *(id(t) for t in terms if here.rows(id(t)) is not None)]
+            for i, left in enumerate(acting):
+                g[place[left]] += here.product(left, "residual")
+                for right in acting[: i + 1]:
+                    H[place[left], place[right]] += here.product(left, right)
+        H = np.tril(H) + np.tril(H, -1).T
+        precision = np.concatenate([np.ones(counts[0]), *(t.deviation**-2.0 for t in terms)])
+        parts = [[(at, x) for key, at in place.items() if (x := h.rows(key)) is not None] for h in joints]
+
+        def joined(joint: int) -> Float[np.ndarray, "rows n"]:
+            A = np.zeros((len(joints[joint].residual), int(ends[-1])))
+            for at, x in parts[joint]:
+                A[:, at] = x
+            return A
+
+        columns = OnDemand(joined, self.dof)
+        return Design(columns, [h.residual for h in joints], precision, (H, g), terms)
 
     @functools.cached_property
     def folds(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -148,14 +246,24 @@ class Problem:
             (np.concatenate([s[0] for s in fold]), np.concatenate([s[1] for s in fold])) for fold in splits
         ]
 
-    def held_out_error(self, design: Design) -> float:
-        """Squared whitened error on blocks that the coefficients were not fitted to."""
+    def held_out_error(self, design: Design, counts: Bool[np.ndarray, " rows"] | None = None) -> float:
+        """Squared whitened error on blocks that the coefficients were not fitted to, in the rows that count.
+
+        What a fold leaves out of the normal equations is subtracted from the whole's.
+        """
+        H, g = design.information, design.g
+        less = [(np.zeros_like(H), np.zeros_like(g)) for _ in self.folds]
+        for A, r in zip(design.columns, design.residual, strict=True):
+            for (train, _), (dH, dg) in zip(self.folds, less, strict=True):
+                out, missing = A[~train], r[~train]
+                dH += out.T @ out
+                dg += out.T @ missing
         error = 0.0
-        for train, test in self.folds:
-            columns = [A[train] for A in design.columns]
-            x = Design(columns, [r[train] for r in design.residual], design.precision).x
+        for (_, test), (dH, dg) in zip(self.folds, less, strict=True):
+            x = scipy.linalg.solve(H - dH, g - dg, assume_a="pos") if len(g) else g
             for A, r in zip(design.columns, design.residual, strict=True):
-                error += float(np.sum((r[test] - A[test] @ x) ** 2))
+                rows = test if counts is None else test & counts
+                error += float(np.sum((r[rows] - A[rows] @ x) ** 2))
         return error
 
     @functools.cached_property
@@ -164,21 +272,39 @@ class Problem:
 
         They join the saturated model: a ripple would otherwise pass for noise of its own frequency.
         """
-        out = []
-        for j in range(self.dof):
-            left, _ = saturated_residual(self.traces, self.residual, j, [])
-            out.append(strongest_order([t.motion.q[:, j] for t in self.traces], left))
-        return out
+
+        def one(joint: int) -> list[np.ndarray]:
+            left, _ = saturated_residual(self.traces, self.residual, joint, [])
+            return strongest_order([t.motion.q[:, joint] for t in self.traces], left)
+
+        for trace in self.traces:  # made once, before there are threads
+            trace.motion.regressor, trace.motion.load  # noqa: B018
+        return parallel(one, range(self.dof))
+
+    @functools.cached_property
+    def _noises(self) -> dict[tuple, tuple]:
+        return {}
 
     def noise(self, terms: Sequence[Term]) -> Noise:
-        """Noise that a saturated model with these terms leaves."""
-        extra = []
-        for j in range(self.dof):
-            here = [t for t in terms if any(np.any(c[:, j]) for c in t.columns)]
-            extra.append(
-                [
-                    np.concatenate([self.ripples[j][r], *(t.columns[r][:, j] for t in here)], 1)
+        """Noise that a saturated model with these terms leaves; of a joint it depends on what acts there."""
+
+        def one(joint: int) -> tuple:
+            here = [t for t in terms if any(np.any(c[:, joint]) for c in t.columns)]
+            key = joint, *(id(t) for t in here)
+            if key not in self._noises:
+                extra = [
+                    np.concatenate([self.ripples[joint][r], *(t.columns[r][:, joint] for t in here)], 1)
                     for r in range(len(self.traces))
                 ]
-            )
-        return estimate(self.traces, self.residual, extra)
+                parts, used = saturated_residual(self.traces, self.residual, joint, extra)
+                self._noises[key] = (*autoregression(parts, used), here)  # keeps what it names alive
+            return self._noises[key][:3]
+
+        self.ripples  # noqa: B018 (made once, before there are threads)
+        a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
+        return Noise(np.stack(a), np.array(sigma), np.array(std))
+
+
+def key_of(effect: AbstractEffect) -> tuple:
+    """What makes two shapes the same."""
+    return type(effect).__name__, *(getattr(effect, f.name) for f in dataclasses.fields(effect))

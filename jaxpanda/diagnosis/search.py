@@ -7,7 +7,6 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.special
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractJointEffect
@@ -15,9 +14,10 @@ from ..effects.contact import ExternalContact
 from ..effects.friction import AsymmetricFriction
 from ..effects.load import PayloadChange
 from .events import BIN, Proposal, ripple, windows
-from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, gram, log_bayes
-from .library import Candidates, columns_of
+from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
+from .library import Candidates
 from .problem import Problem, Term
+from .scan import scales_of
 
 ACCEPT = 25.0
 """Evidence that an effect needs, its search over shapes paid for [nats]."""
@@ -141,10 +141,7 @@ def places(state: State) -> list[slice]:
 
 def without(state: State, i: int) -> Design:
     """The model less one of its terms."""
-    kept = np.ones(len(state.design.precision), bool)
-    kept[places(state)[i]] = False
-    design = state.design
-    return Design([A[:, kept] for A in design.columns], design.residual, design.precision[kept])
+    return state.design.without(i)
 
 
 def gains(state: State) -> list[float]:
@@ -211,29 +208,17 @@ def gate(problem: Problem, state: State, say: Any) -> State:
         once = [t.effect.bound_to_recording for t in state.terms]
         energy = energies(state)[once].sum((0, 1)) if any(once) else np.zeros(len(state.design.residual[0]))
         counts = energy <= 0
-        reference = held_out_error(problem, state.design, counts)
+        reference = problem.held_out_error(state.design, counts)
         for i in np.argsort(gains(state)):
             if once[i]:
                 continue
-            helped = held_out_error(problem, without(state, int(i)), counts) - reference
+            helped = problem.held_out_error(without(state, int(i)), counts) - reference
             if helped < HELD_OUT:
                 say(f"gate {state.terms[i].key}: held-out error falls by {helped:.1f} only")
                 state = with_terms(problem, (*state.terms[:i], *state.terms[i + 1 :]))
                 break
         else:
             return state
-
-
-def held_out_error(problem: Problem, design: Design, counts: np.ndarray) -> float:
-    """Squared whitened error on blocks that the coefficients were not fitted to, in the rows that count."""
-    error = 0.0
-    for train, test in problem.folds:
-        fitted = Design(
-            [A[train] for A in design.columns], [r[train] for r in design.residual], design.precision
-        )
-        for A, r in zip(design.columns, design.residual, strict=True):
-            error += float(np.sum((r - A @ fitted.x)[test] ** 2 * counts[test]))
-    return error
 
 
 def contest(problem: Problem, state: State, say: Any) -> State:
@@ -398,20 +383,20 @@ def handicapped(proposal: Proposal) -> Proposal:
 def grids(problem: Problem, design: Design, noise: Noise, groups: Sequence[Candidates]) -> list[Proposal]:
     """For each effect and place in a library, the likeliest shape and the evidence over all."""
     scores: dict[tuple, list] = defaultdict(list)
+    scanned = problem.scan(design, noise)
     for group in groups:
-        value, scale, deviation = _score(problem, design, noise, group.effects, group.columns, (id(group),))
-        scores[group.name, group.effects[0].joints].append((group, value, scale, deviation))
+        scores[group.name, group.effects[0].joints].append((group, *scanned[id(group)]))
     out = []
     for parts in scores.values():
-        everything = np.concatenate([score for _, score, _, _ in parts])
-        group, score, scale, deviation = max(parts, key=lambda part: part[1].max())
+        everything = np.concatenate([score for _, score, _ in parts])
+        group, score, deviation = max(parts, key=lambda part: part[1].max())
         top = int(score.argmax())
         out.append(
             Proposal(
                 group.effects[top],
-                float(scipy.special.logsumexp(everything) - np.log(len(everything))),
+                float(log_mean_exp(everything)),
                 float(score[top]),
-                deviation[top] * scale[top],
+                deviation[top],
                 first_steps(group.effects[top]),
             )
         )
@@ -425,10 +410,6 @@ def first_steps(effect: AbstractEffect) -> tuple[float, ...]:
         0.3 if s.logarithmic else 0.03 * r if np.isfinite(r) else BIN
         for s, r in zip(effect.shapes, ranges, strict=True)
     )
-
-
-def _scales(coefficients) -> tuple[float, ...]:
-    return SCALES if coefficients[0].scale is None else PHYSICAL_SCALES
 
 
 def _deviation(coefficients, columns: np.ndarray, unit: float) -> Float[np.ndarray, "m n"]:
@@ -453,34 +434,29 @@ def score(
     problem: Problem, design: Design, noise: Noise, effects: Sequence[AbstractEffect]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
     """Evidence of single shapes of one form at one place, and their prior deviations."""
-    columns = []
-    for r, trace in enumerate(problem.traces):
-        here = problem.placed(effects, r)
-        columns.append(columns_of(here, trace) if here else 0.0 * columns_of(effects, trace))
+    columns = problem.columns(effects)
     value, scale, deviation = _score(problem, design, noise, effects, columns)
     return value, deviation * scale[:, None]
 
 
-def _score(problem: Problem, design: Design, noise: Noise, effects, columns, key=None):
-    """Evidence, likeliest scale, and prior deviations before the scale; `key` names columns that come again."""
+def _score(problem: Problem, design: Design, noise: Noise, effects, columns):
+    """Evidence, likeliest scale, and prior deviations before the scale."""
     coefficients = effects[0].coefficients
     signs = np.array([float(k.sign) for k in coefficients])
 
-    def prepared(j, make):
-        if key is not None:
-            return problem.prepared(key, make, noise, j)
-        Phi = problem.whitened(make(), noise, j)
+    def prepared(j, parts):
+        Phi = problem.whitened(parts, noise, j)
         return Phi, gram(Phi)
 
     if isinstance(effects[0], AbstractJointEffect):
         j = effects[0].joints[0]
-        b, G = design.in_joint(j, *prepared(j, lambda: columns))
+        b, G = design.in_joint(j, *prepared(j, columns))
         deviation = _deviation(coefficients, np.concatenate(columns), float(noise.std[j]))
     else:
-        parts = [prepared(j, lambda j=j: [c[:, j] for c in columns]) for j in range(problem.dof)]
+        parts = [prepared(j, [c[:, j] for c in columns]) for j in range(problem.dof)]
         b, G = design.in_arm([p[0] for p in parts], [p[1] for p in parts])
         deviation = _deviation(coefficients, np.concatenate(columns) / noise.std[:, None, None], 1.0)
-    value, scale = log_bayes(b, G, deviation, _scales(coefficients), signs)
+    value, scale = log_bayes(b, G, deviation, scales_of(effects[0]), signs)
     return value, scale, deviation
 
 

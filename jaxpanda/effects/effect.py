@@ -11,6 +11,7 @@ Stribeck friction with and without the Coulomb level that the model already hold
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
@@ -200,6 +201,9 @@ def _plain(value: Any) -> Any:
     return array.item() if array.ndim == 0 else array.tolist()
 
 
+Seconds = Float[Array, ""] | float
+
+
 class AbstractJointEffect(AbstractEffect):
     """An effect in the torque of one joint, that depends on channels at one instant or on their past."""
 
@@ -210,8 +214,18 @@ class AbstractJointEffect(AbstractEffect):
         return (int(self.joint),)
 
     @abc.abstractmethod
-    def columns(self, s: Channels, dt: float) -> Float[Array, "time n"]:
-        """Columns over a recording; `dt` is its time step [s]."""
+    def start(self, s: Channels) -> Float[Array, " states"]:
+        """State at the first instant."""
+
+    @abc.abstractmethod
+    def advance(
+        self, z: Float[Array, " states"], s: Channels, dt: Seconds
+    ) -> tuple[Float[Array, " states"], Float[Array, "time n"]]:
+        """State after a stretch of a recording, and the columns in it; `dt` is its time step [s]."""
+
+    def columns(self, s: Channels, dt: Seconds) -> Float[Array, "time n"]:
+        """Columns over a recording."""
+        return self.advance(self.start(jax.tree.map(lambda a: a[0], s)), s, dt)[1]
 
     def _here(self, value: Array, s: Channels) -> Float[Array, " dof"]:
         """A number of this joint among zeros."""
@@ -225,8 +239,13 @@ class AbstractInstantEffect(AbstractJointEffect):
     def at(self, s: Channels) -> Float[Array, " n"]:
         """Columns at one instant."""
 
-    def columns(self, s: Channels, dt: float) -> Float[Array, "time n"]:
-        return jax.vmap(self.at)(s)
+    def start(self, s: Channels) -> Float[Array, " states"]:
+        return jnp.zeros(0)
+
+    def advance(
+        self, z: Float[Array, " states"], s: Channels, dt: Seconds
+    ) -> tuple[Float[Array, " states"], Float[Array, "time n"]]:
+        return z, jax.vmap(self.at)(s)
 
     def resist(self, c, arm, z, s, dt):
         return Resistance(self._here(self.at(s) @ c, s), jnp.zeros_like(s.q), z)
@@ -264,18 +283,15 @@ class AbstractMemoryEffect(AbstractJointEffect):
     """An effect with a hidden state, stepped through the recording."""
 
     @abc.abstractmethod
-    def start(self, s: Channels) -> Float[Array, " states"]:
-        """State at the first instant."""
-
-    @abc.abstractmethod
     def step(
-        self, z: Float[Array, " states"], s: Channels, dt: float
+        self, z: Float[Array, " states"], s: Channels, dt: Seconds
     ) -> tuple[Float[Array, " states"], Float[Array, " n"]]:
         """State after an instant, and the columns in it."""
 
-    def columns(self, s: Channels, dt: float) -> Float[Array, "time n"]:
-        first = jax.tree.map(lambda a: a[0], s)
-        return jax.lax.scan(lambda z, now: self.step(z, now, dt), self.start(first), s)[1]
+    def advance(
+        self, z: Float[Array, " states"], s: Channels, dt: Seconds
+    ) -> tuple[Float[Array, " states"], Float[Array, "time n"]]:
+        return jax.lax.scan(lambda z, now: self.step(z, now, dt), z, s)
 
     def begin(self, c, arm, s):
         return self.start(s)
@@ -298,23 +314,47 @@ class AbstractArmEffect(AbstractEffect):
         return np.stack([effect.over(motion) for effect in effects], 2)
 
 
-_BUCKET = 2048
+_STRETCH = 2048
+"""Samples that one compiled call takes: recordings of any length share its compilation."""
 
 
 def joint_columns(
     effects: Sequence[AbstractJointEffect], channels: Channels, dt: float
 ) -> Float[np.ndarray, "effects time n"]:
-    """Columns of many shapes of one form at once; lengths are padded so that recordings share compilations."""
-    samples = channels.t.shape[0]
-    short = -samples % _BUCKET
-    padded = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[-1:], short, 0)]), channels)
+    """Columns of many shapes of one form at once, a stretch after the other."""
+    samples, out = channels.t.shape[0], []
     stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *effects)
-    return np.asarray(_joint_columns(stacked, padded, dt))[:, :samples]
+    whole = jax.tree.map(lambda a: np.asarray(a), channels)
+    leaves, structure = jax.tree.flatten(stacked)
+    z = np.zeros(_states(structure, tuple((a.shape, a.dtype) for a in leaves), channels.q.shape[1]))
+    for begin in range(0, samples, _STRETCH):
+        part = jax.tree.map(lambda a, begin=begin: _filled(a[begin : begin + _STRETCH]), whole)
+        z, columns = _advance(stacked, z, np.asarray(begin == 0), part, dt)
+        out.append(columns)
+    return np.concatenate([np.asarray(columns) for columns in out], 1)[:, :samples]
 
 
-@eqx.filter_jit
-def _joint_columns(effects, channels, dt):
-    return jax.vmap(lambda effect: effect.columns(channels, dt))(effects)
+@functools.cache
+def _states(structure: Any, leaves: tuple[tuple, ...], dof: int) -> tuple[int, ...]:
+    """Shape of the hidden states of some shapes of one form, given shape and dtype of what they consist of."""
+    effects = jax.tree.unflatten(structure, [jnp.zeros(*leaf) for leaf in leaves])
+    q = jnp.zeros((1, dof))
+    return jax.eval_shape(_starts, effects, Channels(q[:, 0], q, q, q, q, q)).shape
+
+
+def _filled(a: np.ndarray) -> np.ndarray:
+    short = _STRETCH - len(a)
+    return np.concatenate([a, np.repeat(a[-1:], short, 0)]) if short else a
+
+
+def _starts(effects, channels):
+    return jax.vmap(lambda effect: effect.start(jax.tree.map(lambda a: a[0], channels)))(effects)
+
+
+@jax.jit
+def _advance(effects, z, first, channels, dt):
+    z = jnp.where(first, _starts(effects, channels), z)
+    return jax.vmap(lambda effect, z: effect.advance(z, channels, dt))(effects, z)
 
 
 def smooth_sign(qd: Array, width: Array | float) -> Array:

@@ -8,7 +8,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractMemoryEffect, Coefficient, Resistance, Shape, sign_over_velocity, smooth_sign
+from .effect import (
+    AbstractMemoryEffect,
+    Coefficient,
+    Resistance,
+    Seconds,
+    Shape,
+    sign_over_velocity,
+    smooth_sign,
+)
 from .motion import Channels, Joint
 
 
@@ -66,7 +74,7 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         return smooth_sign(s.qd[self.joint], 0.01)[None]
 
     def step(
-        self, z: Float[Array, " states"], s: Channels, dt: float
+        self, z: Float[Array, " states"], s: Channels, dt: Seconds
     ) -> tuple[Float[Array, " states"], Float[Array, " n"]]:
         qd = s.qd[self.joint]
         moved = qd * dt / self.breakaway_distance

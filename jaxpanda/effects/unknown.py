@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -95,7 +94,8 @@ class Unknown(AbstractInstantEffect):
             "odd in dq_k": jnp.abs(s.qd[self.source]),
         }[self.form]
         knots = jnp.asarray(self.knots)
-        return jax.vmap(lambda e: jnp.interp(x, knots, e))(jnp.eye(knots.shape[0]))
+        passed = jnp.clip((x - knots[:-1]) / jnp.diff(knots), 0.0, 1.0)  # share of each stretch below x
+        return jnp.append(1.0, passed) - jnp.append(passed, 0.0)
 
     def at(self, s: Channels) -> Float[Array, " n"]:
         if not self._odd:

@@ -3,6 +3,7 @@
     python kernels/benchmarks/rnea.py                      # prints the table
     python kernels/benchmarks/rnea.py --baseline           # and replaces the committed baseline
     python kernels/benchmarks/rnea.py --gpu --batch 16777215     # ours on a GPU, and the plain definition
+    python kernels/benchmarks/rnea.py --gpu --mjx --batch 16777215             # and mjx.inverse at batch 1e6
 
 One process for each number of cores, bound to them before anything starts; warm-up first; contenders take
 turns, so that a busy machine is unfair to all of them; results are waited for, on a GPU those of eight calls
@@ -221,6 +222,8 @@ def measure(cores: int, batch: int, rounds: int, folder: Path) -> dict:
     contenders = ours(batch, compilation.__setitem__, all_forms=cores != 1)
     if cores == 1:
         contenders |= pinocchio_loops(folder)
+    elif cores == 0 and (folder / "panda.xml").exists():
+        contenders |= mjx(folder, 1_000_000, compilation.__setitem__)
     elif cores:
         contenders |= mujoco_threads(folder, cores)
         contenders |= mjx(folder, 32, compilation.__setitem__)
@@ -284,6 +287,7 @@ RATIOS = [
     (2, "rnea, mj_inverse on 2 threads, float64", "rnea, columns, float64", 10),
     (2, "rnea, mjx.inverse vmapped over 32, float32", "rnea, columns, float32", 20),
     (0, "rnea, plain definition, float32", "rnea, columns, float32", 10),
+    (0, "rnea, mjx.inverse vmapped over 1000000, float32", "rnea, columns, float32", 200),
 ]
 
 
@@ -294,6 +298,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=100_000, help="samples a call")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--gpu", action="store_true", help="measure JAX's GPU in place of the processor")
+    parser.add_argument("--mjx", action="store_true", help="on a GPU: mjx.inverse beside it, at batch 1e6")
     parser.add_argument(
         "--include", action="append", default=[], help="folder of further C++ headers (Eigen)"
     )
@@ -309,10 +314,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         reasons = {}
-        if not args.gpu:
+        if args.mjx or not args.gpu:
             from jaxpanda.export import panda_mjcf
 
             (folder / "panda.xml").write_text(panda_mjcf())
+        if not args.gpu:
             reasons = build_peers(folder, args.include)
         for cores in [0] if args.gpu else [1, result["machine"]["cores"]]:
             command = [sys.executable, __file__, "--child", str(cores), name]

@@ -1,0 +1,243 @@
+"""The linear scan: evidence of every shape that comes again, by a few large products a joint.
+
+Candidates keep their columns from one step of a search to the next; what changes is the noise and what the model
+holds. So columns lie side by side, coefficient by coefficient, `(rows, n m)`: they are whitened a slice at a
+time, which never leaves the cache, and multiplied with everything in the model at once. Products stay as long
+as the noise of their joint does; then a step costs small matrices only.
+"""
+
+import dataclasses
+import os
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from ..effects import AbstractEffect
+from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
+from .library import Candidates
+from .traces import Trace
+
+if TYPE_CHECKING:
+    from .problem import Problem, Term
+
+_SLICE = 1 << 16
+"""Numbers whitened at a time: half a megabyte."""
+
+
+def parallel(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+    """`work` on each item, on as many threads as there are cores: large products let go of Python's lock."""
+    items, cores = list(items), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    if cores == 1 or len(items) < 2:
+        return [work(item) for item in items]
+    with ThreadPoolExecutor(min(cores, len(items))) as pool:
+        return list(pool.map(work, items))
+
+
+def whitened_slices(
+    x: Float[np.ndarray, "rows n"], traces: Sequence[Trace], noise: Noise, joint: int
+) -> Iterator[tuple[slice, Float[np.ndarray, "_some n"]]]:
+    """`Problem.whitened`, a few rows at a time; rows that are zero for want of a past are left out."""
+    a, order = noise.a[joint], noise.a.shape[1]
+    step = max(8, _SLICE // max(1, x.shape[1]))
+    start = 0
+    for trace in traces:
+        stop = start + trace.motion.samples
+        weight = trace.weight / noise.sigma[joint]
+        for low in range(start + order, stop, step):
+            high = min(low + step, stop)
+            y = a[0] * x[low - 1 : high - 1]
+            for k in range(1, order):
+                y += a[k] * x[low - 1 - k : high - 1 - k]
+            np.subtract(x[low:high], y, out=y)
+            y *= weight[low - start : high - start, None]
+            yield slice(low, high), y
+        start = stop
+
+
+@dataclasses.dataclass
+class Whitened:
+    """What a joint's noise has been applied to, for as long as it stays; `products` are between the rows."""
+
+    stamp: tuple
+    residual: Float[np.ndarray, " rows"]
+    nuisance: Float[np.ndarray, "rows n"]
+    terms: dict[int, tuple["Term", Float[np.ndarray, "rows n"] | None]] = dataclasses.field(
+        default_factory=dict
+    )
+    """By identity; None where a term does not act in the joint."""
+    products: dict[tuple, np.ndarray] = dataclasses.field(default_factory=dict)
+    blocks: dict[Any, tuple[np.ndarray, dict]] = dataclasses.field(default_factory=dict)
+    """For each block of candidates its Gram matrices, and its products by what they are with."""
+
+    def rows(self, key: Any) -> Float[np.ndarray, "rows ..."] | None:
+        if key == "residual":
+            return self.residual
+        return self.nuisance if key == "nuisance" else self.terms[key][1]
+
+    def product(self, left: Any, right: Any) -> np.ndarray:
+        """$A^\\top B$ of two sets of rows."""
+        if (left, right) not in self.products:
+            A, B = self.rows(left), self.rows(right)
+            assert A is not None
+            assert B is not None
+            self.products[left, right] = A.T @ B
+        return self.products[left, right]
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """m candidates of n coefficients each, as columns of one joint: all of the first coefficient first."""
+
+    key: Any
+    joint: int
+    n: int
+    x: Float[np.ndarray, "rows nm"]
+
+    def products(
+        self, problem: "Problem", noise: Noise, design: Design
+    ) -> tuple[Float[np.ndarray, "n n m"], Float[np.ndarray, " nm"], Float[np.ndarray, "p nm"]]:
+        r"""$\Phi^\top\Phi$ of each candidate (its lower triangle), $\Phi^\top r$ and $A^\top\Phi$, whitened."""
+        here = problem.whitened_joint(noise, self.joint, design.terms)
+        acting = [id(t) for t in design.terms if here.terms[id(t)][1] is not None]
+        G, kept = here.blocks.get(self.key, (None, {}))
+        missing = [key for key in ("residual", "nuisance", *acting) if key not in kept]
+        if missing:
+            wanted = [here.rows(key) for key in missing]
+            M = np.column_stack([w for w in wanted if w is not None])
+            found, grams = np.zeros((M.shape[1], self.x.shape[1])), G is None
+            m = self.x.shape[1] // self.n
+            if G is None:
+                G = np.zeros((self.n, self.n, m))
+            for rows, F in whitened_slices(self.x, problem.traces, noise, self.joint):
+                found += M[rows].T @ F
+                if grams:
+                    each = F.reshape(len(F), self.n, m)
+                    for i in range(self.n):
+                        for k in range(i + 1):
+                            G[i, k] += np.einsum("tm,tm->m", each[:, i], each[:, k])
+            splits = np.cumsum([1 if w is None or w.ndim == 1 else w.shape[1] for w in wanted])[:-1]
+            kept = kept | dict(zip(missing, np.split(found, splits), strict=True))
+            here.blocks[self.key] = G, kept
+        A = np.zeros((len(design.g), self.x.shape[1]))
+        place = len(here.nuisance.T)
+        A[:place] = kept["nuisance"]
+        for term in design.terms:
+            width = len(term.deviation)
+            if id(term) in acting:
+                A[place : place + width] = kept[id(term)]
+            place += width
+        assert G is not None
+        return G, kept["residual"][0], A
+
+
+def projected(
+    problem: "Problem", noise: Noise, design: Design, blocks: Sequence[Block]
+) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n n"]]:
+    """b and G (its lower triangle) of candidates that act in the joints of the blocks at once."""
+    n = blocks[0].n
+    parts = [block.products(problem, noise, design) for block in blocks]
+    G, Fr, FA = (sum(p[k] for p in parts[1:]) + parts[0][k] for k in range(3))
+    b = (Fr - design.x @ FA).reshape(n, -1)
+    if design.factor is not None:
+        C = scipy.linalg.solve_triangular(design.factor[0], FA, lower=True, check_finite=False)
+        C = C.reshape(len(C), n, -1)
+        G = G.copy()
+        for i in range(n):
+            for k in range(i + 1):
+                G[i, k] -= np.einsum("pm,pm->m", C[:, i], C[:, k])
+    return b.T, np.moveaxis(G, 2, 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Family:
+    """Candidates of as many coefficients and the same scales, at one joint or in the whole arm."""
+
+    groups: tuple[Candidates, ...]
+    blocks: tuple[Block, ...]
+    signs: Float[np.ndarray, "m n"]
+    plausible: Float[np.ndarray, "m n"]
+    """Size that physics suggests; NaN where the noise decides."""
+    size: Float[np.ndarray, "joints m n"]
+    """rms of the columns in each joint of `blocks`."""
+    scales: tuple[float, ...]
+
+    @property
+    def starts(self) -> np.ndarray:
+        return np.cumsum([0, *(len(g.effects) for g in self.groups)])
+
+    def deviation(self, noise: Noise) -> Float[np.ndarray, "m n"]:
+        """Prior deviation of each coefficient: its plausible size, or that of an effect as large as the noise.
+
+        Of an effect in several joints the one that feels most counts.
+        """
+        std = noise.std[[block.joint for block in self.blocks]]
+        size = (self.size / std[:, None, None]).max(0)
+        most = np.maximum.reduceat(size.max(1), self.starts[:-1])
+        least = np.repeat(1e-9 * np.maximum(most, 1e-12), np.diff(self.starts))
+        return np.where(np.isnan(self.plausible), 1 / np.maximum(size, least[:, None]), self.plausible)
+
+
+def families(groups: Sequence[Candidates], dof: int) -> list[Family]:
+    """Candidates sorted into as few products as can be."""
+    sorted_: dict[tuple, list[Candidates]] = defaultdict(list)
+    for group in groups:
+        k = group.effects[0].coefficients
+        sorted_[group.joint, len(k), scales_of(group.effects[0])].append(group)
+    out = []
+    for (joint, n, scales), members in sorted_.items():
+        blocks, sizes = [], []
+        for j in range(dof) if joint is None else (joint,):
+            x = np.concatenate(
+                [np.concatenate([c if joint is not None else c[:, j] for c in g.columns]) for g in members], 1
+            )
+            sizes.append(np.sqrt((x**2).mean(0)))
+            flat = np.ascontiguousarray(np.swapaxes(x, 1, 2)).reshape(len(x), -1)
+            blocks.append(Block((joint, n, scales), j, n, flat))
+        each = [k for g in members for k in [g.effects[0].coefficients] * len(g.effects)]
+        out.append(
+            Family(
+                tuple(members),
+                tuple(blocks),
+                np.array([[float(c.sign) for c in k] for k in each]),
+                np.array([[np.nan if c.scale is None else c.scale for c in k] for k in each]),
+                np.stack(sizes),
+                scales,
+            )
+        )
+    return out
+
+
+def scales_of(effect: AbstractEffect) -> tuple[float, ...]:
+    """Multiples of the prior deviation that are expected alike."""
+    return SCALES if effect.coefficients[0].scale is None else PHYSICAL_SCALES
+
+
+Score = tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]
+"""Log Bayes factor of each shape of a group, and the prior deviations at its likeliest scale."""
+
+
+def scan(problem: "Problem", design: Design, noise: Noise) -> dict[int, Score]:
+    """Scores of all groups of the library and of the free forms, by the group's identity."""
+
+    def one(family: Family):
+        return family, *projected(problem, noise, design, family.blocks), family.deviation(noise)
+
+    problem.whitened_joints(noise, design.terms)
+    alike: dict[tuple, list] = defaultdict(list)
+    for part in parallel(one, problem.families):
+        alike[part[0].scales, part[1].shape[1]].append(part)
+    out = {}
+    for (scales, _), parts in alike.items():
+        b, G, deviation = (np.concatenate([p[k] for p in parts]) for k in (1, 2, 3))
+        signs = np.concatenate([p[0].signs for p in parts])
+        value, scale = log_bayes(b, G, deviation, scales, signs)
+        groups = [g for p in parts for g in p[0].groups]
+        ends = np.cumsum([len(g.effects) for g in groups])[:-1]
+        values, deviations = np.split(value, ends), np.split(deviation * scale[:, None], ends)
+        out |= {id(g): (v, d) for g, v, d in zip(groups, values, deviations, strict=True)}
+    return out

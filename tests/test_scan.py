@@ -1,0 +1,95 @@
+"""What makes a diagnosis fast changes none of its answers."""
+
+import jax
+import numpy as np
+import pytest
+import scipy.linalg
+
+from jaxpanda import Arm, Recording
+from jaxpanda import signals as signals_
+from jaxpanda.diagnosis.diagnosis import pose
+from jaxpanda.diagnosis.problem import Problem
+from jaxpanda.diagnosis.search import _score
+from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.effects import Channels, joint_columns
+from jaxpanda.effects import effect as effect_
+from jaxpanda.effects.friction import CoulombFriction
+from jaxpanda.effects.memory import PreslidingHysteresis
+
+
+def recording(seed: int, seconds: float, rate: float = 400.0) -> Recording:
+    rng, t = np.random.default_rng(seed), np.arange(0, seconds, 1 / rate)
+    phase = np.array([0.6, 1.1, 1.9]) * t[:, None]
+    q = np.array([0, -0.5, 0, -1.8, 0, 1.6, 0.5]) + np.sin(phase) @ rng.normal(0, 0.2, (3, 7))
+    return Recording(f"{seed}.csv", t, q, tau=rng.normal(0, 1.0, q.shape))
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    traces = tuple(prepare(recording(seed, seconds), Arm.panda()) for seed, seconds in ((0, 4.0), (1, 5.3)))
+    return pose(traces, (True, True), "identified")[0]
+
+
+def channels(samples: int) -> Channels:
+    rng = np.random.default_rng(samples)
+    x = np.cumsum(rng.normal(size=(5, samples, 7)), 1) * 0.003
+    return Channels(np.arange(samples) / 500, *x)
+
+
+def test_a_recording_of_another_length_compiles_nothing_new():
+    effects = [PreslidingHysteresis(2, 0.01, "dahl only"), PreslidingHysteresis(3, 0.02, "dahl only")]
+    joint_columns(effects, channels(700), 0.002)
+    before = effect_._advance._cache_size()
+    for samples in (50, 2048, 5000):
+        assert joint_columns(effects, channels(samples), 0.002).shape == (2, samples, 1)
+    assert effect_._advance._cache_size() == before
+
+
+@pytest.mark.parametrize("effect", [CoulombFriction(1, 0.01), PreslidingHysteresis(1, 0.01, "jenkins whole")])
+def test_columns_by_stretches_are_those_of_the_whole_recording(effect):
+    s = channels(4500)
+    whole = effect.columns(jax.tree.map(jax.numpy.asarray, s), 0.002)
+    assert joint_columns([effect], s, 0.002)[0] == pytest.approx(np.asarray(whole), abs=1e-12)
+
+
+def test_the_low_pass_by_products_is_the_recursive_one(problem: Problem):
+    trace = problem.traces[0]
+    x = np.sign(np.random.default_rng(0).normal(size=(len(trace.channels.t), 2, 3)))
+    expected = signals_.zero_phase(x, trace.cutoff, 1 / trace.dt)[trace.keep]
+    assert len(trace.keep) < len(x)
+    assert np.max(np.abs(trace.down(x) - expected)) < 1e-9
+
+
+def test_the_scan_gives_each_shape_the_evidence_that_it_has_alone(problem: Problem):
+    coulomb = CoulombFriction(3, 0.01)
+    terms = (problem.term(coulomb, np.array([0.3])),)
+    noise = problem.noise(terms)
+    design = problem.design(terms, noise)
+    scanned = problem.scan(design, noise)
+    groups = {(g.name, g.joint): g for g in (*problem.library, *problem.catchalls)}
+    for place in (("stribeck_friction", 3), ("torque_drift", 0), ("unknown", 3), ("encoder_offset", None)):
+        group = groups[place]
+        value, scale, deviation = _score(problem, design, noise, group.effects, group.columns)
+        assert scanned[id(group)][0] == pytest.approx(value, rel=1e-8, abs=1e-8)
+        assert scanned[id(group)][1] == pytest.approx(deviation * scale[:, None], rel=1e-9)
+
+
+def test_held_out_errors_are_those_of_fits_without_the_block(problem: Problem):
+    terms = (problem.term(CoulombFriction(3, 0.01), np.array([0.3])),)
+    design = problem.design(terms, problem.noise(terms))
+    error = 0.0
+    for train, test in problem.folds:
+        H, g = np.diag(design.precision), np.zeros(len(design.precision))
+        for A, r in zip(design.columns, design.residual, strict=True):
+            H, g = H + A[train].T @ A[train], g + A[train].T @ r[train]
+        x = scipy.linalg.solve(H, g)
+        pairs = zip(design.columns, design.residual, strict=True)
+        error += sum(float(np.sum((r[test] - A[test] @ x) ** 2)) for A, r in pairs)
+    assert problem.held_out_error(design) == pytest.approx(error, rel=1e-9)
+
+
+def test_noise_is_estimated_anew_only_where_a_term_acts(problem: Problem):
+    term = problem.term(CoulombFriction(3, 0.01), np.array([0.3]))
+    without, beside = problem.noise(()), problem.noise((term,))
+    assert np.array_equal(np.delete(without.sigma, 3), np.delete(beside.sigma, 3))
+    assert without.sigma[3] != beside.sigma[3]
