@@ -38,7 +38,7 @@ def channels(samples: int) -> Channels:
 
 def test_a_recording_of_another_length_compiles_nothing_new():
     effects = [PreslidingHysteresis(2, 0.01, "dahl only"), PreslidingHysteresis(3, 0.02, "dahl only")]
-    joint_columns(effects, channels(700), 0.002)
+    joint_columns(effects, channels(4500), 0.002)
     before = effect_._advance._cache_size()
     for samples in (50, 2048, 5000):
         assert joint_columns(effects, channels(samples), 0.002).shape == (2, samples, 1)
