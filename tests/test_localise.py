@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxpanda import Arm, Recording
-from jaxpanda.diagnosis.diagnosis import pose
 from jaxpanda.diagnosis.localise import change_points, localise, since_reversal, unbiased
+from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
@@ -40,7 +40,7 @@ def posed():
         traces.append(
             prepare(Recording(f"{seed}.csv", t, noisy, qd=qd, tau=tau + coloured(rng, tau.shape)), arm)
         )
-    return pose(tuple(traces), (True, True), "identified")[0]
+    return pose(tuple(traces), (True, True), "identified").problem
 
 
 def with_noise(problem: Problem, seed: int, planted=None) -> Problem:

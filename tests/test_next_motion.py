@@ -12,8 +12,8 @@ import scipy.interpolate
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis.coverage import held_out_gains, least_shown
 from jaxpanda.diagnosis.decide import Finding
-from jaxpanda.diagnosis.diagnosis import pose
 from jaxpanda.diagnosis.next_motion import motions, next_motion
+from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.search import ACCEPT, grids, with_terms
 from jaxpanda.diagnosis.traces import prepare
@@ -55,7 +55,8 @@ def record(trajectory, seed: int, seconds: float = 10.0) -> Recording:
 def posed(*recordings: Recording) -> tuple[Problem, np.ndarray]:
     arm = Arm.panda()
     traces = tuple(prepare(one, arm) for one in recordings)
-    return pose(traces, (True,) * len(traces), "exact")
+    premises = pose(traces, (True,) * len(traces), "exact")
+    return premises.problem, premises.spread
 
 
 @pytest.fixture(scope="module")

@@ -24,9 +24,10 @@ from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import Finding, coefficients, findings, partly
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
+from .premises import Premises, settled
 from .problem import FOLDS, Problem
-from .search import State, search
-from .traces import Trace, prepare
+from .search import State
+from .traces import prepare
 
 CORRECTED = "corrected.json"
 """What `predict` reads."""
@@ -185,11 +186,11 @@ def diagnose(
             _require_live_torque(recording)
             traces.append(prepare(recording, arm))
             active.append(on)
-    problem, spread = pose(tuple(traces), tuple(active), knowledge)
     log: list[str] = []
-    state = search(problem, log)
+    premises, state = settled(tuple(traces), tuple(active), knowledge, log)
+    problem = premises.problem
     found = tuple(findings(problem, state))
-    corrected = _corrected(arm, problem, state, spread, knowledge)
+    corrected = _corrected(arm, premises, state)
     text, warnings = _corrected_xml(source, corrected)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
@@ -198,13 +199,13 @@ def diagnose(
         fit=fit(problem, state),
         corrected=corrected,
         corrected_xml=text,
-        notes=(*repairs, *(n for t in traces for n in t.signals.notes), *warnings),
+        notes=(*premises.notes, *repairs, *(n for t in traces for n in t.signals.notes), *warnings),
         log=tuple(log),
         problem=problem,
         state=state,
         model_xml=source.text,
-        knowledge=knowledge,
-        spread=spread,
+        knowledge=premises.knowledge,
+        spread=premises.spread,
     )
 
 
@@ -218,16 +219,6 @@ def _require_live_torque(recording: Recording) -> None:
             f"{recording.name}: column tau_{stuck[0] + 1} never changes; a diagnosis needs torque as the sensor"
             " gave it, with its noise"
         )
-
-
-def pose(
-    traces: tuple[Trace, ...], active: tuple[bool, ...], knowledge: knowledge_.Knowledge
-) -> tuple[Problem, Float[np.ndarray, "standard n"]]:
-    """The problem, and the spread of the inertial parameters behind its first nuisance columns."""
-    arm = traces[0].motion.arm
-    empty = Problem(traces, active, tuple(t.motion.q[:, :, None][:, :, :0] for t in traces))
-    spread = knowledge_.inertial_spread(arm, knowledge, empty.noise(()).std)
-    return Problem(traces, active, tuple(knowledge_.nuisance(traces, spread, knowledge))), spread
 
 
 def _errors(problem: Problem, state: State) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -288,19 +279,22 @@ def _verdict(names: Sequence[str], partly: bool) -> str:
     return "unexplained" if set(names) == {"unknown"} else "partly_explained"
 
 
-def _corrected(
-    arm: Arm, problem: Problem, state: State, spread: np.ndarray, knowledge: knowledge_.Knowledge
-) -> Corrected:
+def _corrected(arm: Arm, premises: Premises, state: State) -> Corrected:
     """The arm with the terms, and with what they leave of the nuisance; as it was where nothing was found."""
+    problem = premises.problem
     x = state.design.x[: problem.nuisance[0].shape[2]] * (1.0 if state.terms else 0.0)
-    change, damping, level = knowledge_.changes(arm, x, spread, knowledge)
+    change, damping, level = knowledge_.changes(arm, x, premises.spread, premises.knowledge)
+    effects, values = [], []
+    at = len(x) - sum(len(t.deviation) for t in premises.background)
+    for term in premises.background if state.terms else ():
+        effects.append(term.effect)
+        values.append(jnp.asarray(x[at : at + len(term.deviation)] * term.deviation))
+        at += len(term.deviation)
+    for i, term in enumerate(state.terms):
+        effects.append(term.effect)
+        values.append(jnp.asarray(coefficients(problem, state, i)[0]))
     return Corrected(
-        arm,
-        jnp.asarray(change),
-        jnp.asarray(damping),
-        jnp.asarray(level),
-        tuple(t.effect for t in state.terms),
-        tuple(jnp.asarray(coefficients(problem, state, i)[0]) for i in range(len(state.terms))),
+        arm, jnp.asarray(change), jnp.asarray(damping), jnp.asarray(level), tuple(effects), tuple(values)
     )
 
 

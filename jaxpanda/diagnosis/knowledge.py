@@ -36,6 +36,11 @@ def check(knowledge: str) -> None:
         raise InputError(f"unknown knowledge {knowledge!r}; there are {', '.join(get_args(Knowledge))}")
 
 
+def wider(knowledge: Knowledge) -> Knowledge | None:
+    """What recordings may widen a word to. `exact` is a promise; that nothing is known only the user can say."""
+    return "rough" if knowledge == "identified" else None
+
+
 def inertial_spread(
     arm: Arm, knowledge: Knowledge, noise: Float[np.ndarray, " dof"]
 ) -> Float[np.ndarray, "standard n"]:

@@ -28,7 +28,7 @@ from .events import Proposal, ripple
 from .evidence import Noise
 from .knowledge import Knowledge, nuisance
 from .library import columns_of
-from .problem import Problem, Term
+from .problem import Problem, Term, posed
 from .search import State, grids
 from .traces import Trace, held_sign
 
@@ -137,7 +137,7 @@ def next_motion(
     trace = max(problem.traces, key=lambda t: len(t.channels.t))
     joints = sorted({j for p in pairs for e in (p.a.effect, p.b.effect) for j in e.joints[:1]})
     kinds, ways = zip(*motions(problem, trace, joints), strict=True)
-    new = _placed(trace, ways, spread, knowledge)
+    new = _placed(trace, ways, spread, knowledge, problem.background)
     quick = _told(problem, new, state.noise, [pair.alone for pair in pairs])
     best = sorted(range(1, len(new)), key=lambda i: -min(quick[i]))[:_FINALISTS]
     chosen = [0, *best]
@@ -319,6 +319,7 @@ def _placed(
     ways: Sequence[Float[np.ndarray, "time dof"]],
     spread: Float[np.ndarray, "standard n"],
     knowledge: Knowledge,
+    background: Sequence[Term] = (),
 ) -> list[Problem]:
     """Motions on the grids of a recording, each as a problem of its own, without torque."""
     arm, dt = trace.motion.arm, trace.dt
@@ -335,7 +336,7 @@ def _placed(
         channels = Channels(time, q, qd, qdd, load, load + friction)
         weight = np.ones(len(keep))
         new = Trace("next", trace.signals, channels, dt, motion, None, weight, keep, trace.cutoff, sign)
-        out.append(Problem((new,), (True,), tuple(nuisance([new], spread, knowledge))))
+        out.append(posed((new,), (True,), nuisance([new], spread, knowledge), background))
     return out
 
 

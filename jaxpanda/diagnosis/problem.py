@@ -46,6 +46,8 @@ class Problem:
     active: tuple[bool, ...]
     """Whether effects may act in a recording; not in those of reference."""
     nuisance: tuple[Float[np.ndarray, "_time dof _n"], ...]
+    background: tuple[Term, ...] = ()
+    """Effects that are known already: their columns are in the nuisance, and count as signal in the noise."""
 
     @property
     def dof(self) -> int:
@@ -289,7 +291,7 @@ class Problem:
         """Noise that a saturated model with these terms leaves; of a joint it depends on what acts there."""
 
         def one(joint: int) -> tuple:
-            here = [t for t in terms if any(np.any(c[:, joint]) for c in t.columns)]
+            here = [t for t in (*self.background, *terms) if any(np.any(c[:, joint]) for c in t.columns)]
             key = joint, *(id(t) for t in here)
             if key not in self._noises:
                 extra = [
@@ -308,3 +310,18 @@ class Problem:
 def key_of(effect: AbstractEffect) -> tuple:
     """What makes two shapes the same."""
     return type(effect).__name__, *(getattr(effect, f.name) for f in dataclasses.fields(effect))
+
+
+def posed(
+    traces: tuple[Trace, ...],
+    active: tuple[bool, ...],
+    nuisance: Sequence[Float[np.ndarray, "_time dof _n"]],
+    background: Sequence[Term] = (),
+) -> Problem:
+    """A problem whose background acts in all recordings: its columns, by their deviations, end the nuisance."""
+    everywhere = Problem(traces, (True,) * len(traces), tuple(nuisance))
+    terms = tuple(everywhere.term(t.effect, t.deviation) for t in background)
+    wide = [
+        np.concatenate([n, *(t.columns[r] * t.deviation for t in terms)], 2) for r, n in enumerate(nuisance)
+    ]
+    return Problem(traces, active, tuple(wide), terms)

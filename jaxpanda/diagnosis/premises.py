@@ -1,0 +1,91 @@
+"""What a diagnosis starts from, and whether the recordings bear it out.
+
+Two premises come from the user: how well the model's numbers are known, and recordings of the healthy arm.
+
+- What healthy recordings show beyond the model is no news. It is searched for in them alone first, and joins
+  what may be refitted: else an effect that may act only in the suspect recordings would be credited with
+  explaining half of something that both show.
+- Numbers may be known worse than the user says: a model that was identified without friction, or on another
+  arm, is off by far more than the noise of an identification. If the recordings are likelier by `CONTRADICTION`
+  under a wider word of `knowledge`, beside all effects found, the search is repeated with that word.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from . import knowledge as knowledge_
+from .problem import Problem, Term, posed
+from .search import State, search
+from .traces import Trace
+
+CONTRADICTION, SHARE = 100.0, 0.03
+"""Evidence by which recordings contradict what is said to be known: nats, and as a share of what the effects
+explain, whose shapes are never quite right and leave something for any freedom to take."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Premises:
+    """A problem posed, and what it was posed with."""
+
+    problem: Problem
+    spread: Float[np.ndarray, "standard n"]
+    """Square root of the covariance of the inertial parameters."""
+    knowledge: knowledge_.Knowledge
+    background: tuple[Term, ...] = ()
+    """What the healthy recordings show; its columns, each times its deviation, end the nuisance."""
+    notes: tuple[str, ...] = ()
+
+
+def pose(
+    traces: tuple[Trace, ...],
+    active: tuple[bool, ...],
+    knowledge: knowledge_.Knowledge,
+    background: Sequence[Term] = (),
+) -> Premises:
+    """The problem of these recordings under what is known."""
+    arm = traces[0].motion.arm
+    empty = Problem(traces, active, tuple(t.motion.q[:, :, None][:, :, :0] for t in traces))
+    spread = knowledge_.inertial_spread(arm, knowledge, empty.noise(()).std)
+    columns = knowledge_.nuisance(traces, spread, knowledge)
+    problem = posed(traces, active, columns, background)
+    return Premises(problem, spread, knowledge, problem.background)
+
+
+def settled(
+    traces: tuple[Trace, ...], active: tuple[bool, ...], knowledge: knowledge_.Knowledge, log: list[str]
+) -> tuple[Premises, State]:
+    """Effects found under premises that the recordings do not contradict."""
+    background: tuple[Term, ...] = ()
+    notes: tuple[str, ...] = ()
+    healthy = tuple(t for t, on in zip(traces, active, strict=True) if not on)
+    if healthy:
+        log.append("healthy recordings alone")
+        premises, state = settled(healthy, (True,) * len(healthy), knowledge, log)
+        knowledge, notes = premises.knowledge, premises.notes
+        background = tuple(t for t in state.terms if not t.effect.bound_to_recording)
+        log.append("suspect recordings beside them")
+    while True:
+        premises = dataclasses.replace(pose(traces, active, knowledge, background), notes=notes)
+        state = search(premises.problem, log)
+        wider = _contradicted(premises, state)
+        if wider is None:
+            return premises, state
+        notes = (*notes, f"the recordings contradict that the model's numbers are known as {knowledge!r}:"
+                 f" they were taken as {wider!r}")  # fmt: skip
+        log.append(notes[-1])
+        knowledge = wider
+
+
+def _contradicted(premises: Premises, state: State) -> knowledge_.Knowledge | None:
+    """The wider word, if the recordings are likelier under it beside the effects found, by enough."""
+    word = knowledge_.wider(premises.knowledge)
+    if word is None:
+        return None
+    problem = premises.problem
+    explained = state.design.log_evidence - problem.design((), state.noise).log_evidence
+    other = pose(problem.traces, problem.active, word, premises.background).problem
+    gained = other.design(state.terms, state.noise).log_evidence - state.design.log_evidence
+    return word if gained > max(CONTRADICTION, SHARE * explained) else None

@@ -1,0 +1,37 @@
+"""What a diagnosis starts from: the known may be widened, and what healthy recordings show counts everywhere."""
+
+import numpy as np
+
+from jaxpanda import Arm
+from jaxpanda.diagnosis.knowledge import wider
+from jaxpanda.diagnosis.premises import pose
+from jaxpanda.diagnosis.problem import Problem
+from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.export import panda_mjcf
+from jaxpanda.simulation import JointFriction, Sensors, random_trajectory, simulate
+
+
+def test_recordings_widen_what_was_identified_and_never_a_promise():
+    assert wider("identified") == "rough"
+    assert wider("exact") is None
+    assert wider("rough") is None
+
+
+def test_what_healthy_recordings_show_may_be_refitted_in_all_recordings():
+    motion = random_trajectory(panda_mjcf(), 1, period=3.0)
+    made = [
+        simulate(panda_mjcf(), motion, duration=3.0, rate=200.0, friction=JointFriction(),
+                 sensors=Sensors(torque_noise=0.05), seed=k, name=f"{k}.csv")
+        for k in range(2)
+    ]  # fmt: skip
+    traces = tuple(prepare(one, Arm.panda()) for one in made)
+    plain = Problem(traces, (True, True), tuple(t.motion.q[:, :, None][:, :, :0] for t in traces))
+    known = plain.term(TorqueOffset(3), np.array([0.5]))
+    problem = pose(traces, (True, False), "exact", (known,)).problem
+    for columns in problem.nuisance:
+        np.testing.assert_allclose(columns[:, 3, -1], 0.5, atol=1e-6)
+        assert not np.any(columns[:, [0, 1, 2, 4, 5, 6], -1])
+    news = problem.full_columns([TorqueOffset(3)])
+    assert np.any(news[0])
+    assert not np.any(news[1])  # an effect that is searched for acts in the suspect recording alone
