@@ -106,10 +106,12 @@ def is_worthy(problem: Problem, state: State, proposal: Proposal, say: Any) -> b
         return False
     terms = (*state.terms, problem.term(proposal.effect, proposal.deviation))
     grown = State(terms, state.noise, problem.design(terms, state.noise))
-    least = floors(grown, [*gains(state), proposal.evidence])[-1]
-    if proposal.evidence < least:
-        say(f"{describe([proposal])} is less than {least:.0f}: a shadow")
-    return bool(proposal.evidence >= least)
+    # an earlier scan's evidence, at a joint that was not scanned again, may have gone since
+    evidence = min(proposal.evidence, grown.design.log_evidence - state.design.log_evidence)
+    least = floors(grown, [*gains(state), evidence])[-1]
+    if evidence < least:
+        say(f"{describe([proposal])} brings {evidence:.0f}, less than {least:.0f}: a shadow")
+    return bool(evidence >= least)
 
 
 def settle(problem: Problem, state: State) -> State:
