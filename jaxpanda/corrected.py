@@ -155,8 +155,11 @@ class Corrected(eqx.Module):
 
         One step is exact unless friction depends on the load, which depends on the acceleration.
         """
-        return self.plant().acceleration(
-            memory or self.start(q, qd), jnp.asarray(t), q, qd, tau, dt, jnp.zeros_like(q), iterations=4
+        plant, t = self.plant(), jnp.asarray(t)
+        iterations = 4 if plant.feels("load") else 1
+        guess = jnp.zeros_like(q)
+        return plant.acceleration(
+            memory or self.start(q, qd), t, q, qd, tau, dt, guess, iterations=iterations
         )
 
     def measured_torque(
@@ -275,6 +278,7 @@ class Plant(eqx.Module):
         laws, positions, torques = (tuple(side) for side in sides.values())
         return cls(arm, nominal, laws, positions, torques, level, jnp.where(dry, width, 1.0))
 
+    @eqx.filter_jit
     def begin(self, t: Array, q: Array, qd: Array, tau: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Hidden states of `laws` and of `positions`, for an arm at (q, qd) that transmits `tau`."""
         zero = jnp.zeros_like(q)
@@ -298,6 +302,7 @@ class Plant(eqx.Module):
         torque = torque + jnp.minimum(damping, 0.0) * qd
         return torque, jnp.maximum(damping, 0.0), tuple(d.state for d in done)
 
+    @eqx.filter_jit
     def inverse_dynamics(
         self, memory: tuple[Array, ...], t: Array, q: Array, qd: Array, qdd: Array, dt: float
     ) -> Float[Array, " dof"]:
@@ -305,6 +310,7 @@ class Plant(eqx.Module):
         torque, damping, _ = self.resist(memory, t, q, qd, qdd, dt)
         return self.arm.inverse_dynamics(q, qd, qdd) + torque + damping * qd
 
+    @eqx.filter_jit
     def acceleration(
         self,
         memory: tuple[Array, ...],
