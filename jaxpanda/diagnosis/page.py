@@ -119,7 +119,7 @@ def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -
         interval = (
             "–" if std is None else f"{number(p['value'] - 1.96 * std)} … {number(p['value'] + 1.96 * std)}"
         )
-        rows.append([p["name"], number(p["joint"]), number(p["value"]), interval, p["unit"]])
+        rows.append([p["name"], str(p["joint"]), number(p["value"]), interval, p["unit"]])
     if rows:
         tables.append(Table(["parameter", "joint", "value", "95 % interval", "unit"], rows))
     felt = ["rms", *(number(float(v), 3) for v in one.rms_torque)]
