@@ -7,7 +7,7 @@ import scipy.linalg
 
 from jaxpanda import Arm, Recording
 from jaxpanda import signals as signals_
-from jaxpanda.diagnosis.diagnosis import pose
+from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.search import _score
 from jaxpanda.diagnosis.traces import prepare
@@ -27,7 +27,7 @@ def recording(seed: int, seconds: float, rate: float = 400.0) -> Recording:
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     traces = tuple(prepare(recording(seed, seconds), Arm.panda()) for seed, seconds in ((0, 4.0), (1, 5.3)))
-    return pose(traces, (True, True), "identified")[0]
+    return pose(traces, (True, True), "identified").problem
 
 
 def channels(samples: int) -> Channels:
