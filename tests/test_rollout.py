@@ -71,7 +71,7 @@ def moved() -> Recording:
     friction = JointFriction(coulomb=np.array([1.5, 0.8]), width=0.01)
     sensors = Sensors(torque_noise=0.01, position_noise=1e-6)
     return simulate(
-        source.model, motion, duration=4.0, rate=500, friction=friction, sensors=sensors, name="a.csv"
+        source.model, motion, duration=4.0, rate=500.0, friction=friction, sensors=sensors, name="a.csv"
     )
 
 
