@@ -194,6 +194,7 @@ def environment(**changes: str) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"} | changes
 
 
+@pytest.mark.slow
 def test_four_devices_give_the_answer_of_one(whole, tmp_path):
     code = (
         "import jax, numpy, test_scale; from jaxpanda import session; session.start();"
@@ -208,6 +209,7 @@ def test_four_devices_give_the_answer_of_one(whole, tmp_path):
             np.testing.assert_allclose(four[name], getattr(whole, name), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_starts_and_the_first_alone_writes(table, tmp_path):
     with socket.socket() as free:
         free.bind(("localhost", 0))
