@@ -125,7 +125,7 @@ def _svg(figure: Figure) -> str:
         "lines.linewidth": 0.9,
     }
     with matplotlib.rc_context(style):
-        canvas = Canvas(figsize=figure.size, layout=figure.layout)
+        canvas = Canvas(figsize=figure.size, layout=figure.layout)  # pyright: ignore[reportArgumentType]
         FigureCanvasSVG(canvas)
         figure.draw(canvas)
         buffer = io.StringIO()

@@ -181,9 +181,10 @@ def held_out_gains(
             A, r = A[train], r[train]
             H += A.T @ A
             g += A.T @ r
-            if stacked[j] is None:
+            columns_here = stacked[j]
+            if columns_here is None:
                 continue
-            F = stacked[j][train]
+            F = columns_here[train]
             C[:, index[j]] += A.T @ F
             u[index[j]] += F.T @ r
             for m in at[j]:
@@ -202,8 +203,9 @@ def held_out_gains(
         for j, (A, r) in enumerate(zip(design.columns, design.residual, strict=True)):
             before = r[test] - A[test] @ x
             after = r[test][:, None] - A[test] @ X
-            if stacked[j] is not None:
-                after -= stacked[j][test] @ c[index[j]]
+            columns_here = stacked[j]
+            if columns_here is not None:
+                after -= columns_here[test] @ c[index[j]]
             gains[:, j] += 0.5 * (before @ before - (after**2).sum(0))
     return gains
 
@@ -238,7 +240,7 @@ def least_shown(problem: Problem, state: State) -> tuple[Least, ...]:
     out = []
     for found in rows.values():
         shown = sorted(
-            (one for _, one in found if one.rms_torque is not None), key=lambda one: one.rms_torque
+            (one for _, one in found if one.rms_torque is not None), key=lambda one: one.rms_torque or 0.0
         )
         out.append(shown[len(shown) // 2] if shown else found[0][1])
     order = [c.name for c in CATALOGUE]
@@ -283,7 +285,7 @@ def _least(
         size = np.sqrt(np.mean(np.concatenate(columns) ** 2, 0))
     else:
         parts = [problem.whitened([c[:, j] for c in columns], noise, j) for j in range(problem.dof)]
-        raw = sum(np.einsum("tma,tma->ma", F, F) for F in parts)
+        raw = np.sum([np.einsum("tma,tma->ma", F, F) for F in parts], 0)
         _, G = design.in_arm(parts, [np.einsum("tma,tmb->mab", F, F) for F in parts])
         acting = [np.any(c != 0, axis=(1, 3)) for c in columns]
         felt = sum(np.einsum("tjma->jma", c**2) for c in columns)

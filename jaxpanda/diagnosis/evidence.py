@@ -53,13 +53,13 @@ class OnDemand(Sequence):
     """Arrays that are made when they are asked for."""
 
     def __init__(self, make: Callable[[int], np.ndarray], count: int):
-        self.make, self.count = functools.cache(make), count
+        self.make, self.length = functools.cache(make), count
 
     def __len__(self) -> int:
-        return self.count
+        return self.length
 
     def __getitem__(self, index: Any) -> Any:
-        if not 0 <= index < self.count:
+        if not 0 <= index < self.length:
             raise IndexError(index)
         return self.make(int(index))
 

@@ -270,7 +270,7 @@ def _sums(problem: Problem, noise: Noise, A: list[np.ndarray], H: Any, true: _Si
         C.append(parts[0])
         u.append(parts[1])
         G.append(parts[2])
-    return _Sums(H, g, float(sum(x @ x for x in y)), tuple(C), tuple(u), tuple(G))
+    return _Sums(H, np.asarray(g), float(sum(x @ x for x in y)), tuple(C), tuple(u), tuple(G))
 
 
 def _wide(problem: Problem, shapes: _Shapes, r: int) -> Float[np.ndarray, "_time dof m n"]:
@@ -311,7 +311,7 @@ def _left(sums: _Sums, pair: _Pair) -> float:
         S = S + 1e-9 * (np.trace(G, axis1=1, axis2=2)[:, None, None] / k + 1e-12) * np.eye(k)
         gained = np.einsum("mk,mk->m", b, np.linalg.solve(S, b[:, :, None])[:, :, 0])
         left = min(left, float(best - gained.max()))
-    return max(left, 0.0)
+    return max(float(left), 0.0)
 
 
 def _placed(
