@@ -215,7 +215,7 @@ def test_what_sensors_add_is_undone_and_put_back(moved):
 
 
 def test_bad_calls_say_what_would_work(moved, tmp_path):
-    arm, source = two_links()
+    arm = two_links()[0]
     with pytest.raises(InputError, match="model="):
         rollout.replay(corrected(arm), moved)
     with pytest.raises(InputError, match=r"corrected\.json"):
