@@ -142,7 +142,7 @@ def test_an_effect_of_the_size_that_would_have_shown_has_the_evidence_it_needs(k
         assert trace.tau is not None
         tau = trace.tau + share * row.size * trace.motion.qd[:, 2:3] * np.eye(7)[2]
         planted = Problem((dataclasses.replace(trace, tau=tau),), (True,), problem.nuisance)
-        groups = [g for g in problem.library if isinstance(g.effects[0], ViscousFriction) and g.joint == 2]
+        groups = [g for g in planted.library if isinstance(g.effects[0], ViscousFriction) and g.joint == 2]
         (found[share],) = (p.evidence for p in grids(planted, planted.design((), noise), noise, groups))
     assert found[0.5] < ACCEPT < found[1.5]
     assert found[1.0] == pytest.approx(ACCEPT, abs=16)
