@@ -2,7 +2,6 @@
 
 import copy
 import json
-import time
 
 import numpy as np
 import pytest
@@ -22,15 +21,9 @@ def table() -> dict:
 
 
 @pytest.fixture(scope="module")
-def timed() -> tuple[Retrieval, float]:
-    """The published problem as the defaults solve it, and the processor's seconds for that."""
-    began = time.process_time()
-    return retrieve(table()), time.process_time() - began
-
-
-@pytest.fixture(scope="module")
-def found(timed) -> Retrieval:
-    return timed[0]
+def found() -> Retrieval:
+    """The published problem as the defaults solve it."""
+    return retrieve(table())
 
 
 def test_the_published_coefficients_are_met_as_well_as_any_real_arm_can(found):
@@ -67,10 +60,6 @@ def test_every_margin_is_there_as_numpy_computes_it(found):
         )
         assert bounds.mass[i, 0] <= link["mass"] <= bounds.mass[i, 1]
     assert 16 <= sum(link["mass"] for link in found.links) <= 20
-
-
-def test_the_defaults_take_less_than_a_minute_of_processor_time(timed):
-    assert timed[1] < 60
 
 
 def test_the_certificate_is_below_and_close(found):
