@@ -73,7 +73,7 @@ class Section:
     """On a page, figures stand above the tables."""
 
 
-def number(value: float | None, digits: int = 4) -> str:
+def number(value: float | int | None, digits: int = 4) -> str:
     """A number as people read it; a dash where there is none."""
     return "–" if value is None else f"{value:.{digits}g}"
 

@@ -178,15 +178,7 @@ def diagnosis(found: Any) -> Sequence[Section]:
     """Verdict, each finding with its numbers, and the fit before and after; the page has more."""
     document = found.to_json()
     names = found.corrected.arm.joint_names
-    fit = document["fit"]
-    columns = {
-        "before": fit["rmse_before"],
-        "after": fit["rmse_after"],
-        "held out, before": fit["held_out_rmse_before"],
-        "held out, after": fit["held_out_rmse_after"],
-        "noise floor": fit["noise_floor"],
-    }
-    errors = by_joint("Torque error in the band of the diagnosis [N m]", names, columns)
+    errors = by_joint("Torque error in the band of the diagnosis [N m]", names, fit_columns(document["fit"]))
     sections = [Section("Verdict", found.lines(), [errors])]
     sections += [_finding(i, one, names) for i, one in enumerate(document["findings"])]
     notes = [*document["notes"]]
@@ -217,6 +209,17 @@ def by_joint(caption: str, names: Sequence[str], columns: Mapping[str, Any]) -> 
     present = {head: values for head, values in columns.items() if values is not None and len(values)}
     rows = [[name, *(number(values[i]) for values in present.values())] for i, name in enumerate(names)]
     return Table(["joint", *present], rows, caption)
+
+
+def fit_columns(fit: Mapping[str, Any]) -> dict[str, Any]:
+    """`fit` of diagnosis.json as columns of a table."""
+    return {
+        "before": fit["rmse_before"],
+        "after": fit["rmse_after"],
+        "held out, before": fit["held_out_rmse_before"],
+        "held out, after": fit["held_out_rmse_after"],
+        "noise floor": fit["noise_floor"],
+    }
 
 
 def _repairs(repairs: Mapping[str, int]) -> list[str]:

@@ -11,7 +11,6 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from .evidence import Noise
 from .traces import Trace
 
 ORDER = 3
@@ -75,20 +74,6 @@ def strongest_order(
         power[part] = np.abs(waves)
     n = orders[power.argmax()]
     return [np.stack([np.sin(n * x), np.cos(n * x), np.sin(2 * n * x), np.cos(2 * n * x)], 1) for x in q]
-
-
-def estimate(
-    traces: Sequence[Trace],
-    residual: Sequence[Float[np.ndarray, "_time dof"]],
-    extra: Sequence[Sequence[Float[np.ndarray, "_time _n"]]],
-) -> Noise:
-    """Autoregressive noise of order 3; `extra` holds, for each joint, accepted columns in each recording."""
-    dof = traces[0].motion.dof
-    a, sigma, std = np.zeros((dof, ORDER)), np.zeros(dof), np.zeros(dof)
-    for j in range(dof):
-        parts, used = saturated_residual(traces, residual, j, extra[j])
-        a[j], sigma[j], std[j] = autoregression(parts, used)
-    return Noise(a, sigma, std)
 
 
 def autoregression(

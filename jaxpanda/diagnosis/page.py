@@ -60,7 +60,6 @@ def sections(found: Diagnosis) -> list[Section]:
 
 
 def _verdict(found: Diagnosis, document: Mapping[str, Any], names: Sequence[str]) -> Section:
-    fit = document["fit"]
     sentences = [*found.lines()]
     if not found.findings:
         sentences.append(
@@ -74,15 +73,9 @@ def _verdict(found: Diagnosis, document: Mapping[str, Any], names: Sequence[str]
             f"To decide between {_plain(told.finding)} and {_plain(told.rival)}, record {NEXT_MOTION}:"
             f" {found.next_motion.kind}."
         )
-    columns = {
-        "before": fit["rmse_before"],
-        "after": fit["rmse_after"],
-        "held out, before": fit["held_out_rmse_before"],
-        "held out, after": fit["held_out_rmse_after"],
-        "noise floor": fit["noise_floor"],
-    }
+    columns = summaries.fit_columns(document["fit"])
     table = summaries.by_joint("Torque error in the band of the diagnosis, rms [N·m]", names, columns)
-    floor = np.maximum(np.asarray(fit["noise_floor"]), 1e-12)
+    floor = np.maximum(np.asarray(columns["noise floor"]), 1e-12)
     shades: list[list[float | None]] = []
     for j in range(len(names)):
         row: list[float | None] = [None]
@@ -649,5 +642,5 @@ def _method(found: Diagnosis, names: Sequence[str]) -> Section:
     return Section("How this was found", sentences, tables, listings=[log] if found.log else [])
 
 
-def _listed(values: Sequence[float]) -> str:
+def _listed(values: Sequence[float | int]) -> str:
     return ", ".join(f"{v:g}" for v in values)
