@@ -100,9 +100,12 @@ def run_tool(cases, out, jobs=1):
     """Diagnose all cases; those already in `out` are kept."""
     todo = [(str(c), str(out / c.name)) for c in cases if not (out / c.name / "run.json").exists()]
     # A process keeps every program it compiled: after some ninety cases the system grants it no more memory maps.
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), max_tasks_per_child=30) as pool:
-        for done in pool.map(diagnose, todo):
-            print(f"{done['case']}: {done['seconds']:.1f} s{done['message'] and '  FAILED'}", flush=True)
+    # So each lot of cases has processes of its own. (With `max_tasks_per_child`, Python 3.11 hung.)
+    lot = 30 * jobs
+    for first in range(0, len(todo), lot):
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            for done in pool.map(diagnose, todo[first : first + lot]):
+                print(f"{done['case']}: {done['seconds']:.1f} s{done['message'] and '  FAILED'}", flush=True)
 
 
 # -------------------------------------------------------------------------------- judging one answer

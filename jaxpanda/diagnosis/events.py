@@ -150,7 +150,7 @@ def _binned(
     if ("windows", r) not in here.blocks:
         contacts = trace.motion.wrench_columns[:, :, joint].reshape(trace.motion.samples, -1)
         F = noise.whiten(np.concatenate([contacts, payload.over(trace.motion)[:, joint]], 1), joint)
-        F = split(F * trace.weight[:, None])
+        F = split(F * trace.weights[:, joint, None])
         apart = F[:, :, : contacts.shape[1]].reshape(*F.shape[:2], -1, 6).swapaxes(1, 2)
         whole = F[:, :, contacts.shape[1] :]
         grams = apart.swapaxes(2, 3) @ apart, whole.swapaxes(1, 2) @ whole

@@ -165,14 +165,14 @@ def unbiased(problem: Problem, terms: Sequence[Term], noise: Noise) -> Noise:
     a, sigma, std = np.empty_like(noise.a), np.empty_like(noise.sigma), np.empty_like(noise.std)
     rng, order = np.random.default_rng(0), noise.a.shape[1]
     ends = np.cumsum([t.motion.samples for t in problem.traces])[:-1]
-    weight = np.concatenate([t.weight for t in problem.traces])
+    weights = np.concatenate([t.weights for t in problem.traces])
 
     def autocovariances(x: np.ndarray) -> np.ndarray:
         """Means over the samples that count, of lags 0 to the order."""
         parts = np.split(x, ends)
         return sum(
             np.stack([np.sum(p[: len(p) - k] * p[k:], 0).mean() for k in range(order + 1)]) for p in parts
-        ) / max(weight.sum(), 1.0)
+        ) / max(weights[:, j].sum(), 1.0)
 
     for j in range(problem.dof):
         here = [t for t in terms if any(np.any(c[:, j]) for c in t.columns)]
@@ -185,14 +185,14 @@ def unbiased(problem: Problem, terms: Sequence[Term], noise: Noise) -> Noise:
         values, vectors = np.linalg.eigh(A.T @ A)
         kept = values > 1e-9 * values[-1]
         U = A @ (vectors[:, kept] / np.sqrt(values[kept]))
-        r = np.concatenate([x[:, j] for x in problem.residual]) * weight
+        r = np.concatenate([x[:, j] for x in problem.residual]) * weights[:, j]
         measured = autocovariances((r - U @ (U.T @ r))[:, None])
         e = rng.normal(size=(len(r) + _SETTLE, _SIMULATED))
         gamma = measured
         for _ in range(_ITERATIONS):
             a[j], sigma[j] = _yule_walker(gamma)
             b = np.concatenate([[1.0], -a[j]])
-            x = np.asarray(scipy.signal.lfilter([sigma[j]], b, e, axis=0))[_SETTLE:] * weight[:, None]
+            x = np.asarray(scipy.signal.lfilter([sigma[j]], b, e, axis=0))[_SETTLE:] * weights[:, j, None]
             gamma = measured + autocovariances(x) - autocovariances(x - U @ (U.T @ x))
         a[j], sigma[j] = _yule_walker(gamma)
         std[j] = np.sqrt(gamma[0])
@@ -319,7 +319,9 @@ def order_spectrum(
     orders = step * np.arange(np.ceil(max(5.0, 3 * np.pi / travel) / step), highest / step)
     if len(orders) < 8:
         return np.zeros(0), np.zeros(0), np.zeros(0)
-    moving = [(np.abs(v) > 0.1 * speed) * t.weight for v, t in zip(qd, problem.traces, strict=True)]
+    moving = [
+        (np.abs(v) > 0.1 * speed) * t.weights[:, joint] for v, t in zip(qd, problem.traces, strict=True)
+    ]
     left = [m * e for m, e in zip(moving, whitened_residual(problem, design, joint), strict=True)]
 
     a = noise.a[joint]

@@ -335,7 +335,19 @@ def _placed(
         load = scipy.interpolate.CubicSpline(motion.time, motion.load)(np.minimum(time, motion.time[-1]))
         channels = Channels(time, q, qd, qdd, load, load + friction)
         weight = np.ones(len(keep))
-        new = Trace("next", trace.signals, channels, dt, motion, None, weight, keep, trace.cutoff, sign)
+        new = Trace(
+            "next",
+            trace.signals,
+            channels,
+            dt,
+            motion,
+            None,
+            weight,
+            keep,
+            trace.cutoff,
+            sign,
+            np.ones((len(keep), arm.dof)),
+        )
         out.append(posed((new,), (True,), nuisance([new], spread, knowledge), background))
     return out
 

@@ -45,7 +45,7 @@ def saturated_columns(
     smooth = [rigid, hats(q, 10), speed, hats(load, 5), swings, clock]
     rough = [sign[:, None] * x for x in (speed, hats(q, 4), hats(load, 3), clock[:, ::2])]
     A = np.concatenate([*smooth, *rough, *([np.concatenate(list(extra))] if extra else [])], 1)
-    return A * np.concatenate([t.weight for t in traces])[:, None]
+    return A * np.concatenate([t.weights[:, joint] for t in traces])[:, None]
 
 
 def saturated_residual(
@@ -57,7 +57,7 @@ def saturated_residual(
     """What the saturated model leaves in a joint of each recording, and its degrees of freedom."""
     U, s, _ = np.linalg.svd(saturated_columns(traces, joint, extra), full_matrices=False)
     U = U[:, s > 1e-6 * s[0]]
-    r = np.concatenate([x[:, joint] for x in residual]) * np.concatenate([t.weight for t in traces])
+    r = np.concatenate([x[:, joint] * t.weights[:, joint] for x, t in zip(residual, traces, strict=True)])
     left = r - U @ (U.T @ r)
     return np.split(left, np.cumsum([t.motion.samples for t in traces])[:-1]), U.shape[1]
 

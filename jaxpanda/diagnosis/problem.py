@@ -143,7 +143,7 @@ class Problem:
         """Rows of a joint in all recordings, one below the other, with unit noise."""
         parts = []
         for trace, x in zip(self.traces, columns, strict=True):
-            w = trace.weight.reshape(-1, *[1] * (x.ndim - 1))
+            w = trace.weights[:, joint].reshape(-1, *[1] * (x.ndim - 1))
             parts.append(noise.whiten(x, joint) * w)
         return np.concatenate(parts)
 

@@ -47,7 +47,7 @@ def whitened_slices(
     start = 0
     for trace in traces:
         stop = start + trace.motion.samples
-        weight = trace.weight / noise.sigma[joint]
+        weight = trace.weights[:, joint] / noise.sigma[joint]
         for low in range(start + order, stop, step):
             high = min(low + step, stop)
             y = a[0] * x[low - 1 : high - 1]

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.interpolate
+import scipy.ndimage
 from jaxpanda_kernels import mass_matrix as _mass_matrix
 from jaxtyping import Float
 
@@ -32,6 +33,8 @@ _REST = 5.0
 """Noise of the velocity within which a joint counts as at rest, in standard deviations."""
 _GAP, _NEAR = 3.5, 0.12
 """Missing steps that make a gap, and how far beyond it samples do not count [s]."""
+_BESIDE = 0.02
+"""How far the low-pass of the torque and the noise model carry a wrong sign [s]."""
 _AT_ONCE = 24
 """Samples of the coarse grid that one product filters."""
 _UNFELT = 1e-12
@@ -67,6 +70,13 @@ class Trace:
     """Of the low-pass of torque and columns [Hz]."""
     sign: Float[np.ndarray, "fine dof"]
     """Share of its frictionloss at which each joint's friction stands, on the fine grid."""
+    trust: Float[np.ndarray, "time dof"]
+    """What a sample weighs in each joint, 0 to 1: less where nothing tells which way known friction points."""
+
+    @property
+    def weights(self) -> Float[np.ndarray, "time dof"]:
+        """`weight` and `trust` together."""
+        return self.weight[:, None] * self.trust
 
     @property
     def residual(self) -> Float[np.ndarray, "time dof"]:
@@ -136,6 +146,7 @@ def prepare(
     cutoff = min(0.4 * rate / stride, 0.45 * rate)
 
     sign = held_sign(arm, qd[fine], qdd[fine], width)
+    doubtful = _unsure_sign(position, qd, width, cutoff_q, rate)[fine][kept]
     held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
     held, tau = held_fine[kept], None if rough.tau is None else rough.tau[keep]
     if stride > thin:
@@ -148,7 +159,11 @@ def prepare(
         load = scipy.interpolate.CubicSpline(motion.time, load)(np.clip(time[fine], *motion.time[[0, -1]]))
     channels = Channels(time[fine], q[fine], qd[fine], qdd[fine], load, load + held_fine)
     weight = _weight(recording.time, time[keep], rate)
-    return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign)
+    trust = np.ones(motion.q.shape)
+    if noise is not None:
+        beyond = np.asarray(arm.frictionloss) / np.maximum(noise, 1e-12)
+        trust = 1 / np.sqrt(1 + (beyond * doubtful) ** 2)
+    return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust)
 
 
 def _weight(
@@ -175,6 +190,26 @@ def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):
         ends.append(np.polynomial.polynomial.polyval(at, fitted).T)
     longer = signals_.derivatives(np.concatenate([ends[0], q, ends[1]]), cutoff, rate)
     return tuple(part[more:-more] for part in longer)
+
+
+def _unsure_sign(
+    q: Float[np.ndarray, "time dof"],
+    qd: Float[np.ndarray, "time dof"],
+    least: Float[np.ndarray, " dof"],
+    cutoff: float,
+    rate: float,
+) -> Float[np.ndarray, "time dof"]:
+    """1 where the sign of the velocity cannot be told, else 0; with what filters make of it nearby.
+
+    Before a joint sets out from rest, a sharp filter swings to the other side. A velocity smaller than its
+    difference from that of a filter that does not ring, or than its noise, has no sign.
+    """
+    width = rate * np.sqrt(np.log(2)) / (2 * np.pi * cutoff)
+    smooth = scipy.ndimage.gaussian_filter1d(q, width, 0, mode="nearest", truncate=6.0)
+    error = np.abs(qd - np.gradient(smooth, 1 / rate, axis=0))
+    unsure = np.abs(qd) < 2 * error + least
+    reach = 2 * round(rate * _BESIDE) + 1
+    return scipy.ndimage.maximum_filter1d(unsure.astype(float), reach, axis=0)
 
 
 def _distance(

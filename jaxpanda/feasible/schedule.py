@@ -7,10 +7,11 @@ rounding moves an answer along them by 1e-4 at the same objective.
 """
 
 import collections
+import contextlib
 import functools
 import time
 from collections.abc import Callable, Hashable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -79,20 +80,18 @@ def run(
     if progress is not None and done:
         progress(done, starts)
 
-    def begin(first: int) -> list[list[Array]]:
+    def solved(device: int, first: int) -> list[Array]:
+        numbers = np.minimum(np.arange(chunk) + first, starts - 1)
+        return jax.tree.leaves(programs[device](placed[device], jax.device_put(numbers, mine[device])))
+
+    def begin(first: int) -> list[Future[list[Array]]]:
         """This process's chunks from this start on."""
         first += (jax.process_index() if shared else 0) * share * chunk
-        chunks = []
-        for k in range(share):
-            numbers = np.minimum(np.arange(chunk) + first + k * chunk, starts - 1)
-            device = k % len(mine)
-            chunks.append(
-                jax.tree.leaves(programs[device](placed[device], jax.device_put(numbers, mine[device])))
-            )
-        return chunks
+        return [hands[k % len(mine)].submit(solved, k % len(mine), first + k * chunk) for k in range(share)]
 
-    def finish(first: int, chunks: list[list[Array]]) -> None:
-        parts = [np.concatenate(part) for part in zip(*jax.device_get(chunks), strict=True)]
+    def finish(first: int, chunks: list[Future[list[Array]]]) -> None:
+        fetched = jax.device_get([chunk.result() for chunk in chunks])
+        parts = [np.concatenate(part) for part in zip(*fetched, strict=True)]
         if shared:
             parts = multihost_utils.process_allgather(parts, tiled=True)
         last = min(first + wave, starts)
@@ -105,13 +104,16 @@ def run(
 
     wave = share * chunk * len(processes)
     ahead = 0 if on_cpu else 1  # waves under way while one is fetched
-    under_way: collections.deque[tuple[int, list[list[Array]]]] = collections.deque()
-    for first in range(done, starts, wave):
-        under_way.append((first, begin(first)))
-        if len(under_way) > ahead:
+    under_way: collections.deque[tuple[int, list[Future[list[Array]]]]] = collections.deque()
+    with contextlib.ExitStack() as stack:
+        # A GPU's program asks the host whether to go round its loop again, and holds the thread that called it.
+        hands = [stack.enter_context(ThreadPoolExecutor(1)) for _ in mine]
+        for first in range(done, starts, wave):
+            under_way.append((first, begin(first)))
+            if len(under_way) > ahead:
+                finish(*under_way.popleft())
+        while under_way:
             finish(*under_way.popleft())
-    while under_way:
-        finish(*under_way.popleft())
     return (
         jax.tree.unflatten(jax.tree.structure(like), outcome),
         compiled - began,
