@@ -53,7 +53,7 @@ def every_kind(arm: Arm) -> Corrected:
         arm,
         (StribeckFriction(0, 0.1, 0.01, 1.5, "whole"), [0.3, 0.3]),
         (PreslidingHysteresis(1, 0.01, "dahl extra"), [0.2]),
-        (LoadDependentFriction(1, 0.02, 1.1, "whole"), [0.03, 0.1]),
+        (LoadDependentFriction(1, 0.02, 1.1, "coulomb"), [0.03, 0.1]),
         (Unknown(0, 1, (-1.0, 0.0, 1.0), "of q_k"), [0.2, -0.1, 0.1]),
         (PayloadChange(1, 1.0, EVER, "a.csv", "gained"), body),
         (ExternalContact(1, 0.7, 1.2, "a.csv", "point base", (0.1, 0.0, 0.0)), [3.0, 0.0, 5.0]),

@@ -1,6 +1,7 @@
 """From accepted terms to findings: merged, weighed against their rivals, and said in words."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,9 +24,12 @@ many times the noise's own, in a joint whose residual is at least this share of 
 DOUBT, CROWD = 6.0, 0.6
 """How probability falls with the share that is left in a finding's joints, $e^{-6 s}$, and with every effect
 beyond two that the model needed: who needs many laws has not met the right one."""
+MOST_ALIKE = 2
+"""Terms of one effect at one place, beyond which it is not the right one: three ripples make any shape."""
 STICKS = 1.5e-3
 """Breakaway distance below which friction with memory is Coulomb's that sticks [rad]: a joint at rest holds any
 load up to the level, which a sign of the velocity cannot say."""
+_WIDER = ("stribeck_friction", "asymmetric_friction", "load_dependent_friction", "friction_drift")
 _LISTED = 0.01
 """Probability from which a rival is listed."""
 
@@ -72,16 +76,18 @@ def findings(problem: Problem, state: State) -> list[Finding]:
     groups = together(problem, state.terms)
     before, after = leftover(state)
     left = np.clip(after / np.maximum(before, 1e-9), 0, 1) * (after > LEFT_CLEAR)
-    names = {called(t.effect) for t in state.terms}
+    names = set(titles(state.terms))
     doubt = CROWD ** max(0, len(names) - 2) * np.exp(-DOUBT * shares(state) @ left)
     out = [_finding(problem, state, places, rivals, doubt) for places in groups]
     return sorted(out, key=lambda f: -f.evidence)
 
 
 def partly(state: State) -> bool:
-    """Whether structure is left that the terms do not explain."""
+    """Whether structure is left that the terms do not explain, or one law had to be called on again and again."""
     before, after = leftover(state)
     main = before > LEFT_MAIN * before.max()
+    if any(count > MOST_ALIKE for count in Counter(t.key for t in state.terms).values()):
+        return True
     return bool(np.any(main & (after > LEFT_CLEAR) & (after > LEFT * before)))
 
 
@@ -92,12 +98,25 @@ def called(effect: AbstractEffect) -> str:
     return effect.name
 
 
+def titles(terms: Sequence[Term]) -> list[str]:
+    """What each term is called beside the others: Coulomb's friction is part of the laws that hold it."""
+    out = []
+    for term in terms:
+        name = called(term.effect)
+        if name == CoulombFriction.name:
+            beside = [t.effect.name for t in terms if t.effect.joints == term.effect.joints]
+            name = next((n for n in _WIDER if n in beside), name)
+        out.append(name)
+    return out
+
+
 def together(problem: Problem, terms: Sequence[Term]) -> list[list[int]]:
     """Which terms make one finding: those of one effect at several joints, or that happened at once."""
     out: list[list[int]] = []
+    names = titles(terms)
     for i, term in enumerate(terms):
         for group in out:
-            if any(_same(problem, terms[k], term) for k in group):
+            if any(names[k] == names[i] and _same(problem, terms[k], term) for k in group):
                 group.append(i)
                 break
         else:
@@ -106,8 +125,6 @@ def together(problem: Problem, terms: Sequence[Term]) -> list[list[int]]:
 
 
 def _same(problem: Problem, a: Term, b: Term) -> bool:
-    if called(a.effect) != called(b.effect):
-        return False
     if not a.effect.bound_to_recording:
         return True
     if getattr(a.effect, "recording", "") != getattr(b.effect, "recording", ""):
@@ -156,7 +173,8 @@ def _finding(
     doubt: Float[np.ndarray, " terms"],
 ) -> Finding:
     terms = [state.terms[i] for i in places]
-    effect, name = terms[0].effect, called(terms[0].effect)
+    name = titles(state.terms)[places[0]]
+    effect = next((t.effect for t in terms if t.effect.name == name), terms[0].effect)
     joints = tuple(sorted({j for t in terms for j in t.effect.joints}))
     if effect.bound_to_recording:  # what happened at once happened at one place
         joints = terms[int(np.argmax([rivals[i][0] for i in places]))].effect.joints
@@ -179,7 +197,8 @@ def _finding(
         parameters += term.effect.parameters(c, covariance)
         if term.effect.equation not in equations:
             equations.append(term.effect.equation)
-    clearest = max(places, key=lambda i: rivals[i][0])
+    named = [i for i in places if called(state.terms[i].effect) == name]
+    clearest = max(named, key=lambda i: rivals[i][0])
     sure = 1.0 if name == "unknown" else float(doubt[clearest])
     own = sure * rivals[clearest][2]
     alternatives = sorted(

@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
+from ..effects.drive import Backlash
 from ..effects.friction import AsymmetricFriction
-from ..effects.load import PayloadChange
+from ..effects.load import InertialParameters, Payload, PayloadChange
 from .events import BIN, Proposal, ripple, windows
 from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
 from .library import Candidates
@@ -59,6 +60,10 @@ _SETTLED = 4
 _OVERLAP, _FELT = 0.05, 0.02
 _CLOSE = 0.5
 _GIVEN = 0.2
+_BEYOND = 1e9  # [s]: no recording is as long
+_PAID = 8.0  # [nats]: for the search of when a body changes hands
+CLEAR = 4.0
+"""Standard deviations by which a gap must differ from none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,9 +99,10 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
         if worthy is None:
             break
         state = with_terms(problem, (*state.terms, problem.term(worthy.effect, worthy.deviation)))
-        state = settle(problem, state)
+        state = handed_over(problem, settle(problem, state), say)
         joints = set(np.flatnonzero(shares(state)[-1] > _FELT).tolist())
-    state = prune(problem, swap(problem, prune(problem, state, say), say), say)
+    state = swap(problem, handed_over(problem, prune(problem, state, say), say), say)
+    state = handed_over(problem, prune(problem, state, say), say)
     return gate(problem, contest(problem, state, say), say)
 
 
@@ -260,6 +266,41 @@ def swap(problem: Problem, state: State, say: Any) -> State:
     return state
 
 
+def handed_over(problem: Problem, state: State, say: Any) -> State:
+    """A body at the flange that something happens to was put down or taken up, where that explains both."""
+    last = problem.dof - 1
+    while True:
+        bodies = [
+            i
+            for i, t in enumerate(state.terms)
+            if isinstance(t.effect, Payload | InertialParameters) and t.effect.link == last
+        ]
+        events = [
+            i for i, t in enumerate(state.terms) if isinstance(t.effect, PayloadChange | ExternalContact)
+        ]
+        for i, k in itertools.product(bodies, events):
+            event = state.terms[k].effect
+            others = tuple(t for n, t in enumerate(state.terms) if n not in (i, k))
+            design = problem.design(others, state.noise)
+            tried = []
+            for form, at in (("lost", event.start), ("gained", event.stop), ("lost", event.stop)):
+                if abs(float(at)) > _BEYOND:
+                    continue
+                start, stop = (float(at), _BEYOND) if form == "gained" else (-_BEYOND, float(at))
+                effect = PayloadChange(last, start, stop, event.recording, form)
+                best, deviation = _single(problem, design, state.noise, effect)
+                proposal = Proposal(effect, best, best, deviation, first_steps(effect))
+                tried.append(refine(problem, design, state.noise, proposal))
+            best = max(tried, key=lambda p: p.best, default=None)
+            if best is None or design.log_evidence + best.best < state.design.log_evidence:
+                continue
+            say(f"{state.terms[i].key} and {state.terms[k].key} are one: " + describe([best]))
+            state = with_terms(problem, (*others, problem.term(best.effect, best.deviation)))
+            break
+        else:
+            return state
+
+
 def held_evidence(problem: Problem, state: State, i: int) -> float:
     """Evidence of a term's own shape in its place [nats]."""
     return _single(problem, without(state, i), state.noise, state.terms[i].effect)[0]
@@ -276,6 +317,10 @@ def instead(problem: Problem, state: State, i: int) -> list[Proposal]:
             int(j) for j in np.flatnonzero(shares(state)[i] > _FELT)
         }  # fmt: skip
         scanned = ranked(problem, without(state, i), state.noise, acts)
+        if isinstance(effect, PayloadChange):  # the scan of windows does not see what other recordings say
+            best, deviation = _single(problem, without(state, i), state.noise, effect)
+            own = Proposal(effect, best - _PAID, best, deviation, first_steps(effect))
+            scanned = sorted([own, *scanned], key=lambda p: -p.evidence)
         cache[key] = (scanned, state)  # the state is kept, lest its parts' identities be used again
     held = {t.key for t in others if not t.effect.repeats}
     return [p for p in cache[key][0] if p.key not in held]
@@ -340,7 +385,8 @@ def ranked(
     close = sum(p.evidence > max(_CLOSE * order[0].evidence, 4.0) for p in order[:_REFINED])
     refined = [refine(problem, design, noise, p) for p in order[:close]]
     refined = [p for p in refined if is_dissipative(problem, design, noise, p)]
-    return sorted([*refined, *order[close:]], key=lambda p: -p.evidence)
+    found = [p for p in (*refined, *order[close:]) if has_play(problem, design, noise, p)]
+    return sorted(found, key=lambda p: -p.evidence)
 
 
 def is_dissipative(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
@@ -362,6 +408,19 @@ def is_dissipative(problem: Problem, design: Design, noise: Noise, proposal: Pro
     ]
     power = np.concatenate(power)
     return bool(-power[power < 0].sum() < _GIVEN * power[power > 0].sum())
+
+
+def has_play(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
+    """Whether what calls itself backlash moves across its gap, and does not only swing at its stops.
+
+    Swings alone, with no motion lost, are what an elastic joint makes of noise.
+    """
+    if not isinstance(proposal.effect, Backlash) or proposal.evidence < ACCEPT:
+        return True
+    term = problem.term(proposal.effect, proposal.deviation)
+    grown = problem.design((*design.terms, term), noise)
+    first = len(grown.x) - len(proposal.deviation)
+    return bool(grown.x[first] > CLEAR * np.sqrt(grown.covariance[first, first]))
 
 
 def is_elsewhere(effect: AbstractEffect, joints: Collection[int]) -> bool:

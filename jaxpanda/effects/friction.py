@@ -1,5 +1,6 @@
 """Friction without memory: of velocity, of load, of time."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
@@ -227,9 +228,13 @@ class StribeckFriction(AbstractDryFriction):
 class LoadDependentFriction(AbstractDryFriction):
     r"""Friction that grows with the transmitted torque.
 
-    $$\tau_j = (F_c + \mu\,|\tau_{load}|^p) \tanh(\dot q_j / v_0)$$
+    $$\tau_j = \left(F_c + |\tau_{load}|^p\,(\mu + \kappa \operatorname{sign}(\tau_{load}\,\dot q_j))\right)
+      \tanh(\dot q_j / v_0) + \nu\,|\tau_{load}|^p\,\dot q_j$$
 
-    $\tau_{load}$ is the torque of the rigid arm at the joint, p is near 1. Form "extra" leaves out $F_c$.
+    $\tau_{load}$ is the torque of the rigid arm at the joint, p is near 1. A gear's teeth carry the friction as
+    well as the load, $F = \mu\,|\tau_{load} + F|$: more where the motor drives the load ($\mu/(1 - \mu)$) than
+    where the load drives the motor ($\mu/(1 + \mu)$), which is $\kappa$. The words of `form` say what is there
+    beside $\mu$: "coulomb" $F_c$, "directed" $\kappa$, "viscous" $\nu$.
 
     References:
         Bittencourt et al., IROS 2010; Duclusaud et al., arXiv 2410.08650.
@@ -249,28 +254,55 @@ class LoadDependentFriction(AbstractDryFriction):
     def grid(cls, arm: Arm) -> Sequence["LoadDependentFriction"]:
         return [
             cls(j, v0, 1.0, form)
-            for form in ("extra", "whole")
+            for form in ("", "coulomb")
             for v0 in (0.004, 0.02, 0.06)
             for j in range(arm.dof)
         ]
 
+    def variants(self, arm: Arm) -> Sequence["LoadDependentFriction"]:
+        forms = ("directed", "coulomb directed", "viscous", "directed viscous")
+        return [dataclasses.replace(self, form=form) for form in forms if form != self.form]
+
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        growth = Coefficient("load_coefficient", "1", sign=1)
-        return (growth,) if self.form == "extra" else (growth, Coefficient("coulomb", "N·m", sign=1))
+        of_words = {
+            "coulomb": Coefficient("coulomb", "N·m", sign=1),
+            "directed": Coefficient("load_asymmetry", "1"),
+            "viscous": Coefficient("load_damping", "s/rad"),
+        }
+        return (Coefficient("load_coefficient", "1", sign=1), *(of_words[w] for w in self.form.split()))
 
     @property
     def equation(self) -> str:
-        level = "" if self.form == "extra" else "coulomb + "
-        return f"tau = ({level}load_coefficient * |tau_load|^exponent) * tanh(dq / v0)"
+        words = self.form.split()
+        level = "coulomb + " if "coulomb" in words else ""
+        factor = (
+            "(load_coefficient + load_asymmetry * sign(tau_load * dq))"
+            if "directed" in words
+            else "load_coefficient"
+        )
+        slope = " + load_damping * |tau_load|^exponent * dq" if "viscous" in words else ""
+        return f"tau = ({level}{factor} * |tau_load|^exponent) * tanh(dq / v0){slope}"
 
     @property
     def feels(self) -> Literal["motion", "load", "acceleration"]:
         return "load"
 
+    def _loaded(self, s: Channels) -> Array:
+        return (jnp.abs(s.load[self.joint]) + 1e-9) ** self.exponent
+
     def levels(self, s: Channels) -> Float[Array, " n"]:
-        loaded = (jnp.abs(s.load[self.joint]) + 1e-9) ** self.exponent
-        return jnp.stack([loaded] if self.form == "extra" else [loaded, jnp.ones_like(loaded)])
+        loaded = self._loaded(s)
+        of_words = {
+            "coulomb": jnp.ones_like(loaded),
+            "directed": loaded * jnp.sign(s.load[self.joint]) * smooth_sign(s.qd[self.joint], self.v0),
+            "viscous": jnp.zeros_like(loaded),
+        }
+        return jnp.stack([loaded, *(of_words[w] for w in self.form.split())])
+
+    def remainder(self, s: Channels) -> Float[Array, " n"]:
+        slope = self._loaded(s) * s.qd[self.joint]
+        return jnp.stack([0 * slope, *(slope * (w == "viscous") for w in self.form.split())])
 
 
 class FrictionDrift(AbstractDryFriction):
@@ -279,8 +311,8 @@ class FrictionDrift(AbstractDryFriction):
     $$\tau_j = g(t)\,(a \tanh(\dot q_j / v_0) + b\,\dot q_j) + F_c \tanh(\dot q_j / v_0) + F_v \dot q_j, \qquad
       g(t) = 1 - e^{-t/T}$$
 
-    A long time constant is a linear trend. Form "level" has `a` and `F_c` only, "slope" `b` and `F_v`;
-    "... extra" leaves out the constant part.
+    A long time constant is a linear trend. Form "level" has `a` and `F_c` only, "slope" `b` and `F_v`, "both"
+    all; "... extra" leaves out the constant part.
 
     References:
         Simoni et al., Robotica 2017; Wolf and Iskandar, ICRA 2018.
@@ -311,6 +343,9 @@ class FrictionDrift(AbstractDryFriction):
             for j in range(arm.dof)
         ]
 
+    def variants(self, arm: Arm) -> Sequence["FrictionDrift"]:
+        return [dataclasses.replace(self, form=form) for form in ("both", "both extra") if form != self.form]
+
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         level, slope = Coefficient("coulomb_change", "N·m"), Coefficient("damping_change", "N·m·s/rad")
@@ -320,6 +355,7 @@ class FrictionDrift(AbstractDryFriction):
             "slope extra": (slope,),
             "slope": (slope, Coefficient("damping", "N·m·s/rad")),
             "both extra": (level, slope),
+            "both": (level, slope, Coefficient("coulomb", "N·m"), Coefficient("damping", "N·m·s/rad")),
         }[self.form]
 
     @property
@@ -333,6 +369,8 @@ class FrictionDrift(AbstractDryFriction):
                 "slope extra": f"damping_change * {g} * dq",
                 "slope": f"(damping + damping_change * {g}) * dq",
                 "both extra": f"{g} * (coulomb_change * tanh(dq / v0) + damping_change * dq)",
+                "both": f"(coulomb + coulomb_change * {g}) * tanh(dq / v0)"
+                f" + (damping + damping_change * {g}) * dq",
             }[self.form]
         )
 
@@ -346,6 +384,7 @@ class FrictionDrift(AbstractDryFriction):
                 "slope extra": [none],
                 "slope": [none, none],
                 "both extra": [g, none],
+                "both": [g, none, one, none],
             }[self.form]
         )
 
@@ -359,6 +398,7 @@ class FrictionDrift(AbstractDryFriction):
                 "slope extra": [slope],
                 "slope": [slope, qd],
                 "both extra": [none, slope],
+                "both": [none, slope, none, qd],
             }[self.form]
         )
 
