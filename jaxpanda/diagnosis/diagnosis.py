@@ -26,7 +26,7 @@ from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
-from .search import State
+from .search import State, transferable
 from .traces import prepare
 
 CORRECTED = "corrected.json"
@@ -190,13 +190,21 @@ def diagnose(
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
     problem = premises.problem
     found = tuple(findings(problem, state))
-    corrected = _corrected(arm, premises, state)
+    kept = transferable(problem, state)
+    corrected = _corrected(arm, premises, kept)
+    dropped = [t.effect.name.replace("_", " ") for t in state.terms if all(t is not k for k in kept.terms)]
+    if dropped:
+        premises = dataclasses.replace(
+            premises,
+            notes=(*premises.notes, "left out of the corrected model, as what fits one recording does harm in"
+                   f" another: {', '.join(sorted(set(dropped)))}"),
+        )  # fmt: skip
     text, warnings = _corrected_xml(source, corrected)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
         verdict=_verdict([f.effect for f in found], partly(state)),
         findings=found,
-        fit=fit(problem, state),
+        fit=fit(problem, kept),
         corrected=corrected,
         corrected_xml=text,
         notes=(*premises.notes, *repairs, *(n for t in traces for n in t.signals.notes), *warnings),

@@ -42,7 +42,8 @@ def saturated_columns(
     swings = np.stack([np.concatenate(rates), np.concatenate(bends)], 1)
     speed = hats(np.abs(qd), 8)
     clock = scipy.linalg.block_diag(*[hats(t.motion.time, 10) for t in traces])
-    smooth = [rigid, hats(q, 10), speed, hats(load, 5), swings, clock]
+    shaken = stacked(lambda t: t.shaken[:, joint])
+    smooth = [rigid, shaken, hats(q, 10), speed, hats(load, 5), swings, clock]
     rough = [sign[:, None] * x for x in (speed, hats(q, 4), hats(load, 3), clock[:, ::2])]
     A = np.concatenate([*smooth, *rough, *([np.concatenate(list(extra))] if extra else [])], 1)
     return A * np.concatenate([t.weights[:, joint] for t in traces])[:, None]

@@ -249,19 +249,31 @@ class Problem:
         ]
 
     def held_out_error(self, design: Design, counts: Bool[np.ndarray, " rows"] | None = None) -> float:
-        """Squared whitened error on blocks that the coefficients were not fitted to, in the rows that count.
+        """Squared whitened error on blocks that the coefficients were not fitted to, in the rows that count."""
+        return self._error_on(design, self.folds, counts)
 
-        What a fold leaves out of the normal equations is subtracted from the whole's.
-        """
+    def transferred_error(self, design: Design) -> float:
+        """Squared whitened error on recordings that the coefficients were not fitted to."""
+        of = np.repeat(np.arange(len(self.traces)), [t.motion.samples for t in self.traces])
+        folds = [(of != r, of == r) for r, on in enumerate(self.active) if on]
+        return self._error_on(design, folds) if len(folds) > 1 else 0.0
+
+    def _error_on(
+        self,
+        design: Design,
+        folds: Sequence[tuple[np.ndarray, np.ndarray]],
+        counts: Bool[np.ndarray, " rows"] | None = None,
+    ) -> float:
+        """What a fold leaves out of the normal equations is subtracted from the whole's."""
         H, g = design.information, design.g
-        less = [(np.zeros_like(H), np.zeros_like(g)) for _ in self.folds]
+        less = [(np.zeros_like(H), np.zeros_like(g)) for _ in folds]
         for A, r in zip(design.columns, design.residual, strict=True):
-            for (train, _), (dH, dg) in zip(self.folds, less, strict=True):
+            for (train, _), (dH, dg) in zip(folds, less, strict=True):
                 out, missing = A[~train], r[~train]
                 dH += out.T @ out
                 dg += out.T @ missing
         error = 0.0
-        for (_, test), (dH, dg) in zip(self.folds, less, strict=True):
+        for (_, test), (dH, dg) in zip(folds, less, strict=True):
             x = scipy.linalg.solve(H - dH, g - dg, assume_a="pos") if len(g) else g
             for A, r in zip(design.columns, design.residual, strict=True):
                 rows = test if counts is None else test & counts

@@ -229,6 +229,23 @@ def gate(problem: Problem, state: State, say: Any) -> State:
             return state
 
 
+def transferable(problem: Problem, state: State) -> State:
+    """Without the terms that do harm in recordings to which their coefficients were not fitted.
+
+    What stands in for physics that has no name fits where it was fitted, and misleads elsewhere.
+    """
+    while True:
+        harm = {
+            i: problem.transferred_error(state.design) - problem.transferred_error(without(state, i))
+            for i, t in enumerate(state.terms)
+            if not t.effect.bound_to_recording
+        }
+        worst = max(harm, key=lambda i: harm[i], default=None)
+        if worst is None or harm[worst] <= 0:
+            return state
+        state = with_terms(problem, (*state.terms[:worst], *state.terms[worst + 1 :]))
+
+
 def contest(problem: Problem, state: State, say: Any) -> State:
     """At joints that took two named terms and more, see if one free form does better than all of them."""
     for joint in range(problem.dof):

@@ -7,6 +7,7 @@ the cutoff of the torque: an autoregressive noise model on samples closer than t
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +34,10 @@ _REST = 5.0
 """Noise of the velocity within which a joint counts as at rest, in standard deviations."""
 _GAP, _NEAR = 3.5, 0.12
 """Missing steps that make a gap, and how far beyond it samples do not count [s]."""
+_SHAKEN = (2.5, 5.0)
+"""Where the bands begin in which noise of q, differentiated twice, may outweigh the motion [Hz]."""
+_SHARPER, _SHARP = 2.5, 6.0
+"""Where motion is looked for that a filter took away, in its cutoffs; and how far above noise it must be."""
 _BESIDE = 0.02
 """How far the low-pass of the torque and the noise model carry a wrong sign [s]."""
 _AT_ONCE = 24
@@ -71,7 +76,8 @@ class Trace:
     sign: Float[np.ndarray, "fine dof"]
     """Share of its frictionloss at which each joint's friction stands, on the fine grid."""
     trust: Float[np.ndarray, "time dof"]
-    """What a sample weighs in each joint, 0 to 1: less where nothing tells which way known friction points."""
+    """What a sample weighs in each joint, 0 to 1: less where nothing tells which way known friction points, and
+    where the motion is sharper than the filter of q lets through."""
 
     @property
     def weights(self) -> Float[np.ndarray, "time dof"]:
@@ -83,6 +89,15 @@ class Trace:
         """Measured less nominal torque [N m]."""
         assert self.tau is not None
         return self.tau - self.motion.torque
+
+    @functools.cached_property
+    def shaken(self) -> Float[np.ndarray, "time dof bands"]:
+        r"""What noise of the encoders may have put into the nominal torque, in the bands where it is most of
+        $\ddot q$: $M_{\cdot k}(q)$ times joint k's acceleration in each."""
+        qdd, rate = self.motion.qdd, 1 / self.motion.dt
+        below = [signals_.zero_phase(qdd, cutoff, rate) for cutoff in _SHAKEN if cutoff < 0.45 * rate]
+        bands = [high - low for low, high in itertools.pairwise([*below, qdd])]
+        return np.concatenate([self.motion.mass * band[:, None] for band in bands], 2)
 
     def down(self, fine: Float[np.ndarray, "fine ..."]) -> Float[np.ndarray, "time ..."]:
         """From the fine grid to the coarse one, filtered like the torque."""
@@ -161,8 +176,10 @@ def prepare(
     weight = _weight(recording.time, time[keep], rate)
     trust = np.ones(motion.q.shape)
     if noise is not None:
-        beyond = np.asarray(arm.frictionloss) / np.maximum(noise, 1e-12)
-        trust = 1 / np.sqrt(1 + (beyond * doubtful) ** 2)
+        unsure = np.asarray(arm.frictionloss) * doubtful
+        cut_off = _cut_off(position, qdd, cutoff_q, rate)[keep]
+        unsure = np.hypot(unsure, (np.abs(motion.mass) @ cut_off[:, :, None])[:, :, 0])
+        trust = 1 / np.sqrt(1 + (unsure / np.maximum(noise, 1e-12)) ** 2)
     return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust)
 
 
@@ -210,6 +227,16 @@ def _unsure_sign(
     unsure = np.abs(qd) < 2 * error + least
     reach = 2 * round(rate * _BESIDE) + 1
     return scipy.ndimage.maximum_filter1d(unsure.astype(float), reach, axis=0)
+
+
+def _cut_off(
+    q: Float[np.ndarray, "time dof"], qdd: Float[np.ndarray, "time dof"], cutoff: float, rate: float
+) -> Float[np.ndarray, "time dof"]:
+    """Acceleration that the filter of q takes away [rad/s²]: where it is far above its noise, else 0."""
+    lost = np.abs(_derivatives(q, min(_SHARPER * cutoff, 0.4 * rate), rate)[2] - qdd)
+    noise = np.median(lost, axis=0) / 0.6745
+    lost = np.where(lost > _SHARP * noise, lost, 0.0)
+    return scipy.ndimage.maximum_filter1d(lost, 2 * round(rate * 2 * _BESIDE) + 1, axis=0)
 
 
 def _distance(

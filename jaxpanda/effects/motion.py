@@ -83,9 +83,14 @@ class Motion:
         return self._over(_link_axes, self.q)
 
     @functools.cached_property
+    def mass(self) -> Float[np.ndarray, "time dof dof"]:
+        """The mass matrix with armature [kg m²]."""
+        return self._over(_masses, self.q)
+
+    @property
     def inertia(self) -> Float[np.ndarray, "time dof"]:
         """What each joint turns [kg m²]: the diagonal of the mass matrix."""
-        return self._over(_inertias, self.q)
+        return np.diagonal(self.mass, axis1=1, axis2=2)
 
     @functools.cached_property
     def slope(self) -> Float[np.ndarray, "time dof"]:
@@ -97,7 +102,7 @@ class Motion:
         """What each joint turns, in the mean over some poses of the motion [kg m²]."""
         poses = self.q[:: max(1, self.samples // 16)][:16]
         poses = np.concatenate([poses, np.repeat(poses[-1:], 16 - len(poses), 0)])
-        return np.asarray(_inertias(self.arm, poses)).mean(0)
+        return np.diagonal(np.asarray(_masses(self.arm, poses)).mean(0))
 
     def sensitivity(self, dq: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, "time dof"]:
         """Change of the smooth torque [N m] for a small change `dq(t)` of the joint positions, to first order."""
@@ -173,8 +178,8 @@ def _slopes(arm, q, qd, qdd):
 
 
 @jax.jit
-def _inertias(arm, q):
-    return jax.vmap(lambda q: jnp.diag(mass_matrix(arm.chain, arm.standard, q)) + arm.armature)(q)
+def _masses(arm, q):
+    return jax.vmap(lambda q: mass_matrix(arm.chain, arm.standard, q) + jnp.diag(arm.armature))(q)
 
 
 def wrench_columns(arm: Arm, q: Float[Array, " dof"]) -> Float[Array, "links dof 6"]:
