@@ -235,7 +235,7 @@ def _errors(problem: Problem, state: State) -> tuple[list[np.ndarray], list[np.n
     explained = []
     for i, (n, t) in enumerate(zip(problem.nuisance, problem.traces, strict=True)):
         columns = np.concatenate([n, *(term.columns[i] for term in state.terms)], 2)
-        explained.append((columns @ state.design.x) * t.weight[:, None])
+        explained.append((columns @ problem.explained(state.design.x)) * t.weight[:, None])
     return before, [b - e for b, e in zip(before, explained, strict=True)]
 
 
@@ -268,7 +268,7 @@ def held_out(problem: Problem, state: State) -> list[tuple[np.ndarray, np.ndarra
             dataclasses.replace(t, weight=t.weight * train)
             for t, (train, _) in zip(problem.traces, splits, strict=True)
         )
-        x = dataclasses.replace(problem, traces=traces).design(state.terms, state.noise).x
+        x = problem.explained(dataclasses.replace(problem, traces=traces).design(state.terms, state.noise).x)
         for r, (_, test) in enumerate(splits):
             out[r][0][test] -= everything[r][test] @ x
     return out

@@ -80,6 +80,13 @@ class Problem:
             out.append(dataclasses.replace(c, columns=columns))
         return out
 
+    def explained(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """The coefficients less those of the encoders' noise, which belongs to a recording and to no model."""
+        stop = self.nuisance[0].shape[2] - sum(len(t.deviation) for t in self.background)
+        x = x.copy()
+        x[stop - self.traces[0].shaken.shape[2] : stop] = 0.0
+        return x
+
     def term(self, effect: AbstractEffect, deviation: Float[np.ndarray, " n"]) -> Term:
         """The effect's columns in all recordings."""
         return Term(effect, tuple(self.full_columns([effect])), deviation)
