@@ -6,18 +6,22 @@ import numpy as np
 import pytest
 from jaxpanda_kernels import inertia
 
+from jaxpanda.certificate import lower_bound
 from jaxpanda.errors import InputError
 from jaxpanda.feasible import (
     Bounds,
     Links,
     com_in_cylinder,
     com_in_hull,
+    interior,
     mass_in_ellipsoid,
+    small,
     solve,
     total_mass,
     triangle_inequality,
     when,
 )
+from jaxpanda.feasible.solver import scaled_problem, solve_chunk, starting_points
 from jaxpanda.panda import panda
 
 
@@ -85,7 +89,7 @@ def test_extra_unknowns_stay_in_their_bounds(reachable):
 
 def test_the_same_seed_gives_the_same_starts_whatever_the_chunk():
     A, b = np.eye(10)[:1], np.array([5.0])
-    found = [solve(A, b, boxes(1), starts=6, chunk=chunk, rounds=1, iterations=1) for chunk in (6, 4)]
+    found = [solve(A, b, boxes(1), starts=6, chunk=chunk, iterations=3) for chunk in (6, 4)]
     for other in found[1:]:
         np.testing.assert_allclose(other.phi, found[0].phi, rtol=1e-9)
     assert len(np.unique(found[0].phi[:, 0, 3])) == 6
@@ -233,3 +237,101 @@ def test_binary_garbage_is_no_table_of_bounds(tmp_path):
 def test_equations_that_make_no_sense_are_refused(A, b, complaint):
     with pytest.raises(InputError, match=complaint):
         solve(A, b, boxes(1))
+
+
+@pytest.fixture(scope="module")
+def bodies() -> small.Matrices:
+    """Positive definite 4x4 matrices of 3 links and 5 lanes, of condition 1 to 1e4."""
+    X = np.random.default_rng(4).normal(size=(3, 5, 4, 4)) * np.logspace(0, -2, 5)[:, None, None]
+    return jnp.moveaxis(jnp.asarray(X @ np.swapaxes(X, -1, -2) + 1e-4 * np.eye(4)), 1, -1)
+
+
+def test_small_inverses_products_and_entries_agree_with_numpy(bodies):
+    one_by_one = np.moveaxis(np.asarray(bodies), -1, 1)
+    inverse = np.moveaxis(np.asarray(small.inverse(bodies)), -1, 1)
+    np.testing.assert_allclose(inverse @ one_by_one, np.broadcast_to(np.eye(4), inverse.shape), atol=1e-9)
+    both = np.moveaxis(np.asarray(small.product(bodies, bodies)), -1, 1)
+    np.testing.assert_allclose(both, one_by_one @ one_by_one, rtol=1e-12)
+    np.testing.assert_array_equal(small.symmetric(small.entries(bodies)), bodies)
+    # <S(s), Z> = s . adjoint(Z)
+    Z = jnp.roll(bodies, 1, 0)
+    np.testing.assert_allclose(
+        small.inner(bodies, Z), jnp.sum(small.entries(bodies) * small.adjoint(Z), (0, 1)), rtol=1e-12
+    )
+
+
+def test_the_small_curvature_is_the_hessian_of_minus_log_det(bodies):
+    at = lambda s: -jnp.linalg.slogdet(small.symmetric(s[None, :, None])[0, :, :, 0])[1]
+    S = bodies[1:2, :, :, 2:3]
+    inverse = small.inverse(S)
+    expected = jax.hessian(at)(small.entries(S)[0, :, 0])
+    found = small.curvature(inverse, inverse)[0, :, :, 0]
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * float(jnp.abs(expected).max()))
+
+
+def test_the_longest_step_ends_at_the_boundary(bodies):
+    one_by_one = np.moveaxis(np.asarray(bodies), -1, 0)
+    D = -3.0 * jnp.roll(bodies, 1, -1)
+    found = small.longest_step(bodies, D)
+    for lane, alpha in enumerate(np.asarray(found)):
+        least = lambda a, lane=lane: np.linalg.eigvalsh(one_by_one[lane] + a * np.asarray(D)[..., lane]).min()
+        assert least(0.999 * alpha) > 0
+        assert alpha == 1.0 or least(alpha + 0.02) < 0
+
+
+@pytest.fixture(scope="module")
+def chunked(reachable):
+    """The outcome of 40 starts when 40, and when 16 of them at a time, take their steps."""
+    A, b, bounds, _ = reachable
+    problem = scaled_problem(A, b, bounds, (), np.array([0.3]), np.array([0.7]))
+    x0 = starting_points(problem, 40, 5)
+    return problem, x0, [jax.jit(lambda p, x, n=n: solve_chunk(p, x, lanes=n))(problem, x0) for n in (40, 16)]
+
+
+def test_starts_that_leave_when_done_end_where_they_would_have_ended(chunked):
+    _, _, (whole, few) = chunked
+    # Another number of lanes sums in another order; of the same number, every bit is the same.
+    np.testing.assert_allclose(few.phi, whole.phi, rtol=0, atol=1e-10)
+    np.testing.assert_array_equal(few.iterations, whole.iterations)
+    assert len(np.unique(whole.iterations)) > 1
+
+
+def test_every_start_begins_strictly_inside_and_apart_from_the_others(chunked):
+    problem, x0, _ = chunked
+    assert np.all(problem.G @ x0.T + problem.d[:, None] > 0)
+    S = np.moveaxis(np.asarray(interior.matrices(problem, x0.T)), -1, 0)
+    assert np.linalg.eigvalsh(S).min() > 0
+    assert len(np.unique(x0[:, 0])) == len(x0)
+
+
+def test_a_converged_start_is_as_close_to_the_certified_optimum_as_it_claims():
+    """Two real bodies cannot have these: the lower bound is far from zero."""
+    clarabel = pytest.importorskip("clarabel")
+    assert clarabel
+    A, b = np.random.default_rng(2).normal(size=(18, 20)), 3 * np.random.default_rng(3).normal(size=18)
+    bound = lower_bound(A, b, boxes(2)).lower_bound
+    found = solve(A, b, boxes(2), starts=16)
+    assert bound > 1.0
+    assert found.converged.all()
+    assert np.all(found.objective >= bound * (1 - 1e-6))
+    np.testing.assert_allclose(found.objective, bound, rtol=1e-4)
+
+
+def test_boxes_that_are_points_are_kept():
+    mass = np.array([[2.0, 2.0]])
+    com = np.array([[[0.0, 0.0], [-0.1, 0.1], [-0.1, 0.1]]])
+    bounds = Bounds(mass, com, boxes(1).inertia, np.array([1.0, 3.0]))
+    found = solve(np.eye(10)[:4], np.array([3.0, 0.1, 0.1, 0.0]), bounds, starts=4)
+    assert np.all(found.violation == 0)
+    np.testing.assert_array_equal(found.phi[:, 0, 0], 2.0)
+    np.testing.assert_array_equal(found.phi[:, 0, 1], 0.0)
+    np.testing.assert_allclose(found.objective, 1.01, rtol=1e-4)
+
+
+def test_a_box_on_the_inertia_binds_where_it_should():
+    """min (Ixx - 0.5)² under Ixx about the centre of mass <= 0.1, the centre of mass at the origin."""
+    box = np.array([[0.0, 0.1], [0, 1.0], [0, 1.0], [-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]])
+    bounds = Bounds(np.array([[1.0, 2.0]]), np.zeros((1, 3, 2)), box[None])
+    found = solve(np.eye(10)[4:5], np.array([0.5]), bounds, starts=4)
+    assert np.all(found.violation == 0)
+    np.testing.assert_allclose(found.objective, 0.16, rtol=1e-4)

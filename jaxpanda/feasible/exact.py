@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 from ..errors import InputError, require_x64
 from .bounds import Bounds
 from .constraints import Constraint, Links, triangle_inequality
-from .solver import XYZ_MATRIX, Problem, Solutions, largest_violation, scaled_problem
+from .interior import XYZ_MATRIX, Problem
+from .solver import Solutions, largest_violation, scaled_problem
 
 STEPS = 10
 """The paper's kappa: how often the penalty is raised."""

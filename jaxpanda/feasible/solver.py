@@ -1,25 +1,19 @@
 r"""Many-start least squares over physically feasible links.
 
-$$\min_{x}\ \lVert A\,(\phi(x), \theta) - b\rVert^2 \quad\text{over links that could be built}$$
+$$\min_{x}\ \lVert A\,(\phi, \theta) - b\rVert^2 \quad\text{over links that could be built}$$
 
-**Coordinates.** A link is $x = (m, c, L)$ with $\Sigma_c = LL^\top + \epsilon 1$ its second moment about the
-centre of mass and $L$ lower triangular. Every $x$ is a real body: $\Sigma_c \succeq 0$ *is* the triangle
-inequality. The boundary, where the optimum of real data lies, is at finite coordinates (log-Cholesky has it
-at infinity and crawls). Boxes on $m$, $c$ and $\theta$ are kept exactly, by projection.
+**Coordinates.** A link's pseudo-inertia $J$ holds $m$, $mc$ and the second moment about a point, in which $\phi$
+is linear; $J \succ 0$ is positive mass, positive inertia and the triangle inequality at once, and boxes on $m$,
+$c$ ($m\,c_{lo} \le mc \le m\,c_{hi}$), the total mass and $\theta$ are linear. So the problem is convex but
+for what the user adds: no valley to crawl along, and each start's distance from the optimum is known.
 
-**Steps.** Newton with Levenberg's damping. With $D = \partial\phi/\partial x$ and $\Gamma$ the gradient with
-respect to $\Sigma_c$, the Hessian is $2D^\top A^\top A D$ plus one block a link,
-$\mathrm{diag}(0,\, 2m\Gamma,\, 2\,\Gamma \otimes 1)$, plus a coupling of $m$ and $c$ proportional to
-$\partial f/\partial c$. At an optimum $\Gamma \succeq 0$ (the multiplier of the triangle inequality) and the
-coupling vanishes for every free $c$. So $\Gamma$ is replaced by its positive part and the coupling left
-out: each step's matrix is positive definite, and it is the exact Hessian where it matters. Gauss-Newton alone
-would converge linearly, because the residual does not vanish. Valleys curve; each step is bent along
-(`_bend`).
+**Method.** `interior`: every start follows a path of its own inside the constraints, which therefore hold exactly
+at its end. Boxes on inertias about the centre of mass and the user's constraints, convex or not, enter as squared
+hinges with multipliers (augmented Lagrangian), aimed a little inside so that what is left is exactly no
+violation.
 
-**Constraints** (inertia boxes, total mass, the user's) enter as squared hinges with multipliers (augmented
-Lagrangian), aimed a little inside so that what is left is exactly no violation.
-
-Every start does the same work, so that a batch of them is a batch of small dense algebra.
+**Work.** A step costs one Cholesky factor of all unknowns and four triangular solves a start; the links' 4x4
+matrices are handled entry by entry, the starts contiguous (`small`). A start that is done leaves (`solve_chunk`).
 """
 
 import dataclasses
@@ -34,34 +28,32 @@ from jaxpanda_kernels import inertia
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..errors import InputError, require_x64
-from . import schedule
+from . import interior, schedule, small
 from .bounds import Bounds
 from .checkpoint import Checkpoint, identity
-from .constraints import Constraint, Links, triangle_inequality
+from .constraints import Constraint, Links, total_mass, triangle_inequality
+from .interior import FIRST, MASS, PER_LINK, XYZ_COLUMN, XYZ_ROW, Problem
 
 STARTS = 2048
 """Default number of random starts."""
-CHUNK = 64
-ROUNDS = 4
-ITERATIONS = 25
-"""Newton steps a round; after each round the multipliers of the constraints are updated."""
-
+CHUNK = {"cpu": 512, "gpu": 32768}
+"""Starts handed to a device at once, by its platform."""
 _BLOCK = 4096  # starts whose objective is evaluated at once
+ITERATIONS = 80
+"""Steps of a start at most."""
+TOLERANCE = 3e-3
+"""A start has converged where no more than this share of its objective is left to gain."""
+PRECISE = 16
+"""The first so many starts converge to `_PRECISION`: of what all of them find, the best is known well."""
+_PRECISION = 1e-5
+
 _TRIANGLE_INSET = 1e-8  # [kg m²]
-_COM_INSET = 1e-9  # [m]: m c / m need not give c to the last bit
-_MARGIN_INSET = 1e-6  # in the constraint's own unit
-_DAMPING = 1e-2
-_MOST_BEND = 0.375
-_WEIGHT = 1.0
+_BOX_INSET = 1e-9  # [kg], [m]: m c / m need not give c to the last bit
 _LEAST_MASS = 1e-3  # [kg]: a link without mass is no body, and MuJoCo refuses it
+_SEGMENT, _LEAST_LANES = 3, 128
 
 _ROW = np.array([0, 1, 1, 2, 2, 2])
 _COLUMN = np.array([0, 0, 1, 0, 1, 2])
-_SAME_COLUMN = (_COLUMN[:, None] == _COLUMN).astype(float)
-# The order xx, yy, zz, xy, xz, yz of tables.
-XYZ_ROW = np.array([0, 1, 2, 0, 0, 1])
-XYZ_COLUMN = np.array([0, 1, 2, 1, 2, 2])
-XYZ_MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +69,8 @@ class Solutions:
     violation: Float[np.ndarray, " starts"]
     """Largest amount by which a bound or constraint is missed, recomputed from `phi`; 0 where none is."""
     converged: Bool[np.ndarray, " starts"]
-    """Feasible, and the last round's second half gained less than 0.1 %."""
+    """Feasible, and within the tolerance of the optimum (of a local one, where a constraint is not convex), as
+    the step that aims at the optimum estimates it."""
     iterations: Int[np.ndarray, " starts"]
     """Steps that lowered the objective."""
     compile_seconds: float
@@ -102,9 +95,9 @@ def solve(
     initial: Float[np.ndarray, "given dof 10"] | None = None,
     starts: int = STARTS,
     seed: int = 0,
-    chunk: int = CHUNK,
-    rounds: int = ROUNDS,
+    chunk: int | None = None,
     iterations: int = ITERATIONS,
+    tolerance: float = TOLERANCE,
     devices: Sequence[schedule.Device] | None = None,
     checkpoint: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -121,9 +114,11 @@ def solve(
         initial: parameters to start from in place of as many random starts; moved into the boxes.
         starts: number of starts.
         seed: same seed, same answer, whatever the chunk.
-        chunk: how many starts are solved at once on each device; bounds the memory.
-        rounds: how often the constraints' multipliers are updated.
-        iterations: Newton steps a round.
+        chunk: how many starts are handed to a device at once, which bounds the memory; `CHUNK` when None.
+        iterations: steps of a start at most.
+        tolerance: a start has converged when no more than this share of its objective is left to gain (the first
+            `PRECISE` go on to a hundred-thousandth). Where the optimum is not unique, each ends as near to
+            where it began as this permits.
         devices: over which the starts are spread; see `schedule.run`.
         checkpoint: file that keeps the starts as they finish. Where it holds starts of this same problem from a
             run that was interrupted, they are not solved again, and the answer has the same bits. The caller
@@ -137,14 +132,17 @@ def solve(
     problem = scaled_problem(A, b, bounds, tuple(constraints), extra_lower, extra_upper)
     if starts < 1:
         raise InputError(f"starts: {starts} is too few; at least 1")
-    steps = (rounds, iterations)
+    steps = (iterations, tolerance)
+    if chunk is None:
+        platform = (jax.local_devices() if devices is None else devices)[0].platform
+        chunk = CHUNK.get(platform, CHUNK["gpu"])
     kept = None
     if checkpoint is not None:
         further = (extra_lower, extra_upper, initial)
         kept = Checkpoint(checkpoint, identity(A, b, bounds, constraints, further, seed, steps))
     found, compile_seconds, run_seconds = schedule.run(
         _solve_starts,
-        _origin(problem, bounds, seed, initial),
+        _origin(problem, seed, initial),
         steps,
         starts=starts,
         chunk=chunk,
@@ -179,26 +177,6 @@ def _objectives(
     return objective
 
 
-class Problem(eqx.Module):
-    """One problem in scaled form; unknowns x = (m, c, L of each link; extra), flat."""
-
-    A: Float[Array, "rows columns"]
-    """Scaled so that the Hessian's diagonal is about one."""
-    b: Float[Array, " rows"]
-    Q: Float[Array, "columns columns"]
-    """2 AᵀA."""
-    lower: Float[Array, " columns"]
-    upper: Float[Array, " columns"]
-    scale: Float[Array, " columns"]
-    """A typical size of each unknown."""
-    mass: Float[Array, "dof 2"]
-    com: Float[Array, "dof 3 2"]
-    inertia: Float[Array, "dof 6 2"]
-    total_mass: Float[Array, " 2"]
-    constraints: tuple[Constraint, ...] = eqx.field(static=True)
-    dof: int = eqx.field(static=True)
-
-
 def scaled_problem(
     A: Float[np.ndarray, "rows columns"],
     b: Float[np.ndarray, " rows"],
@@ -220,350 +198,300 @@ def scaled_problem(
     high = np.full(extra, np.inf) if extra_upper is None else np.asarray(extra_upper, float)
     if low.shape != (extra,) or high.shape != (extra,):
         raise InputError(f"bounds of the extra unknowns: expected {extra}, got {low.size} and {high.size}")
-    least = np.minimum(np.maximum(bounds.mass[:, 0], _LEAST_MASS), bounds.mass[:, 1])
-    com = _inset(bounds.com, _COM_INSET)
-    unbounded = np.full((dof, 6), np.inf)
-    lower = np.concatenate([least[:, None], com[..., 0], -unbounded], -1)
-    upper = np.concatenate([bounds.mass[:, 1:], com[..., 1], unbounded], -1)
-    scale = np.concatenate(
-        [_width(bounds.mass)[:, None], _width(com), np.repeat(_root_inertia(bounds)[:, None], 6, 1)], -1
+    mass = _inset(
+        np.stack(
+            [np.minimum(np.maximum(bounds.mass[:, 0], _LEAST_MASS), bounds.mass[:, 1]), bounds.mass[:, 1]], -1
+        )
     )
-    # phi is of the order of (m, m c, L Lᵀ): enough to bring the Hessian's diagonal to order one.
-    size = scale[:, 1:4].max(-1)
-    order = np.stack([scale[:, 0], scale[:, 0] * size, scale[:, 4] ** 2], -1)
-    order = order[:, [0, 1, 1, 1, 2, 2, 2, 2, 2, 2]].ravel()
-    norms = np.linalg.norm(A, axis=0)
-    of_extra = np.where(norms > 0, np.linalg.norm(b) / np.where(norms > 0, norms, 1), 0)[10 * dof :]
+    com = _inset(bounds.com)
+    # Units of a link: its middling mass, and half its box for a radius of gyration.
+    radius = 0.5 * np.linalg.norm(bounds.com[..., 1] - bounds.com[..., 0], axis=-1) + 0.02
+    unit = np.stack([bounds.mass.mean(-1), radius], -1)
+    centre = bounds.com.mean(-1)
+    to_phi = _to_phi(unit, centre)
+    norms = np.linalg.norm(A[:, 10 * dof :], axis=0)
+    of_extra = np.where(norms > 0, np.linalg.norm(b) / np.where(norms > 0, norms, 1), 0)
     of_extra = np.minimum(of_extra, np.where(high > low, high - low, np.inf))
     of_extra = np.where(of_extra > 0, of_extra, 1.0)
-    sigma = np.sqrt(np.mean((norms * np.concatenate([order, of_extra])) ** 2)) or 1.0
-    A_scaled, b_scaled = jnp.asarray(A / sigma), jnp.asarray(b / sigma)
+    scaled = np.concatenate(
+        [
+            np.einsum("rli,lij->rlj", A[:, : 10 * dof].reshape(-1, dof, 10), to_phi).reshape(len(A), -1),
+            A[:, 10 * dof :] * of_extra,
+        ],
+        1,
+    )
+    sigma = np.sqrt(np.mean(np.sum(scaled**2, 0))) or 1.0
+    G, d, free = _linear(
+        mass / unit[:, :1], (com - centre[..., None]) / unit[:, 1:, None], low / of_extra, high / of_extra
+    )
+    total = _total_mass(bounds, mass)
+    if total is not None:
+        for row, sign, bound in ((PER_LINK * dof, 1, total[0]), (PER_LINK * dof + 1, -1, -total[1])):
+            if np.isfinite(bound):
+                weight = unit[:, 0].sum()
+                G[row, MASS : 10 * dof : 10] = sign * unit[:, 0] / weight
+                d[row] = -bound / weight
+    elif bounds.total_mass is not None:
+        constraints = (*constraints, total_mass(*bounds.total_mass))
+    A_scaled, b_scaled = jnp.asarray(scaled / sigma), jnp.asarray(b / sigma)
     return Problem(
         A=A_scaled,
         b=b_scaled,
         Q=2 * A_scaled.T @ A_scaled,
-        lower=jnp.asarray(np.concatenate([lower.ravel(), low])),
-        upper=jnp.asarray(np.concatenate([upper.ravel(), high])),
-        scale=jnp.asarray(np.concatenate([scale.ravel(), of_extra])),
+        G=jnp.asarray(G),
+        d=jnp.asarray(d),
+        free=jnp.asarray(free),
+        to_phi=jnp.asarray(to_phi),
+        shift=jnp.asarray(_TRIANGLE_INSET / (unit[:, 0] * unit[:, 1] ** 2)),
+        unit=jnp.asarray(unit),
+        centre=jnp.asarray(centre),
+        extra_unit=jnp.asarray(of_extra),
+        extra_box=jnp.asarray(np.stack([low, high], -1) / of_extra[:, None]),
+        mass_box=jnp.asarray(mass / unit[:, :1]),
+        com_box=jnp.asarray((com - centre[..., None]) / unit[:, 1:, None]),
+        total_box=jnp.asarray(np.array([-np.inf, np.inf]) if total is None else total),
         mass=jnp.asarray(bounds.mass),
         com=jnp.asarray(bounds.com),
         inertia=jnp.asarray(bounds.inertia),
         total_mass=jnp.asarray([-np.inf, np.inf] if bounds.total_mass is None else bounds.total_mass),
         constraints=constraints,
         dof=dof,
+        boxed=bool(np.any(np.isfinite(_beyond_the_triangle(bounds.inertia)))),
     )
 
 
-def _inset(box: Float[np.ndarray, "*shape 2"], by: float) -> Float[np.ndarray, "*shape 2"]:
-    """The box moved inwards, at most by a quarter of its width."""
-    inset = np.minimum(by, (box[..., 1] - box[..., 0]) / 4)
-    return np.stack([box[..., 0] + inset, box[..., 1] - inset], -1)
-
-
-def _width(box: Float[np.ndarray, "*shape 2"]) -> Float[np.ndarray, "*shape"]:
-    """Widths, one where the box is a point."""
+def _inset(box: Float[np.ndarray, "*shape 2"]) -> Float[np.ndarray, "*shape 2"]:
+    """The box moved inwards; one that is a point, or nearly, becomes a point."""
     width = box[..., 1] - box[..., 0]
-    return np.where(width > 0, width, 1.0)
+    middle = box.mean(-1)
+    low = np.where(width > 10 * _BOX_INSET, box[..., 0] + _BOX_INSET, middle)
+    high = np.where(width > 10 * _BOX_INSET, box[..., 1] - _BOX_INSET, middle)
+    return np.stack([low, high], -1)
 
 
-def _root_inertia(bounds: Bounds) -> Float[np.ndarray, " dof"]:
-    """Typical entry of L: what a link of middling mass with half its box for a radius of gyration has."""
-    radius = 0.5 * np.linalg.norm(bounds.com[..., 1] - bounds.com[..., 0], axis=-1) + 0.02
-    return radius * np.sqrt(bounds.mass.mean(-1))
+def _beyond_the_triangle(box: Float[np.ndarray, "dof 6 2"]) -> Float[np.ndarray, "dof 6 2"]:
+    r"""Bounds of xx, yy, zz, xy, xz, yz without those that a real body meets anyway.
+
+    $I_{xx} \ge 0$, and $\lvert I_{xy}\rvert \le \tfrac12 I_{zz}$.
+    """
+    box = box.copy()
+    diagonal, product = box[:, :3], box[:, 3:]
+    diagonal[..., 0] = np.where(diagonal[..., 0] <= 0, -np.inf, diagonal[..., 0])
+    most = 0.5 * diagonal[:, ::-1, 1]  # of zz, yy, xx
+    product[..., 0] = np.where(product[..., 0] <= -most, -np.inf, product[..., 0])
+    product[..., 1] = np.where(product[..., 1] >= most, np.inf, product[..., 1])
+    return box
+
+
+def _to_phi(
+    unit: Float[np.ndarray, "dof 2"], centre: Float[np.ndarray, "dof 3"]
+) -> Float[np.ndarray, "dof 10 10"]:
+    """From the ten entries of a link's scaled pseudo-inertia about `centre` to phi."""
+    found = np.zeros((len(unit), 10, 10))
+    for l, ((mass, length), c) in enumerate(zip(unit, centre, strict=True)):
+        X = np.eye(4)
+        X[:3, 3] = c
+        X = X @ np.diag([length, length, length, 1.0])
+        for q, (i, k) in enumerate(small.PAIRS):
+            E = np.zeros((4, 4))
+            E[i, k] = E[k, i] = 1.0
+            found[l, :, q] = mass * _phi(X @ E @ X.T)  # not its root twice: a fixed mass keeps its last bit
+    return found
+
+
+def _phi(J: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "10"]:
+    I = np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3]
+    return np.concatenate([J[3:, 3], J[:3, 3], I[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]])
+
+
+def _linear(
+    mass: Float[np.ndarray, "dof 2"],
+    com: Float[np.ndarray, "dof 3 2"],
+    low: Float[np.ndarray, " extra"],
+    high: Float[np.ndarray, " extra"],
+) -> tuple[Float[np.ndarray, "linear columns"], Float[np.ndarray, " linear"], Float[np.ndarray, " columns"]]:
+    """`Problem.G`, `d` and `free` for scaled boxes, but for the total mass; an absent row is 0 u + 1 > 0."""
+    dof, extra = len(mass), len(low)
+    columns, first = 10 * dof + extra, PER_LINK * dof + 2
+    G, d, free = np.zeros((first + 2 * extra, columns)), np.ones(first + 2 * extra), np.ones(columns)
+
+    def add(row: int, column: int, sign: int, bound: float, of_mass: int | None = None) -> None:
+        """sign (u[column] - bound) > 0, or with the bound times a link's mass."""
+        if np.isfinite(bound):
+            G[row, column], d[row] = sign, 0.0
+            if of_mass is None:
+                d[row] = -sign * bound
+            else:
+                G[row, of_mass] = -sign * bound
+
+    for link in range(dof):
+        m, row = 10 * link + MASS, PER_LINK * link
+        free[m] = mass[link, 0] < mass[link, 1]
+        if free[m]:
+            add(row, m, 1, mass[link, 0])
+            add(row + 1, m, -1, mass[link, 1])
+        for k in range(3):
+            h = 10 * link + FIRST[k]
+            free[h] = com[link, k, 0] < com[link, k, 1]
+            if free[h]:
+                add(row + 2 + 2 * k, h, 1, com[link, k, 0], m)
+                add(row + 3 + 2 * k, h, -1, com[link, k, 1], m)
+    for k in range(extra):
+        free[10 * dof + k] = low[k] < high[k]
+        if free[10 * dof + k]:
+            add(first + k, 10 * dof + k, 1, low[k])
+            add(first + extra + k, 10 * dof + k, -1, high[k])
+    return G, d, free
+
+
+def _total_mass(bounds: Bounds, mass: Float[np.ndarray, "dof 2"]) -> Float[np.ndarray, " 2"] | None:
+    """The box of the total mass; an end is infinite where the links' own boxes imply it.
+
+    None where nothing lies inside.
+    """
+    if bounds.total_mass is None:
+        return None
+    least, most = mass.sum(0)
+    low, high = bounds.total_mass + np.array([_BOX_INSET, -_BOX_INSET])
+    if min(high, most) - max(low, least) < 1e-6 * most:
+        return None
+    return np.array([low if low > least else -np.inf, high if high < most else np.inf])
 
 
 def starting_points(
     problem: Problem,
-    bounds: Bounds,
     starts: int,
     seed: int,
     *,
     first: int = 0,
     initial: Float[np.ndarray, "given dof 10"] | None = None,
 ) -> Float[Array, "starts columns"]:
-    """Starts number `first`, `first` + 1, ...: random points of the box, the given ones in place of the first.
+    """Starts number `first`, `first` + 1, ...: random bodies, the given ones in place of the first.
 
     A start depends on its number and the seed alone.
     """
     drawn = jax.jit(jax.vmap(_start, in_axes=(None, 0)))
-    return drawn(_origin(problem, bounds, seed, initial), first + jnp.arange(starts))
+    return drawn(_origin(problem, seed, initial), first + jnp.arange(starts))
 
 
 class _Origin(eqx.Module):
     """Where starts come from."""
 
     problem: Problem
-    middling: Float[Array, " dof"]
-    """Masses in the middle of their boxes [kg]."""
-    given: Float[Array, "given links"]
-    """Links' coordinates to start from in place of random ones."""
+    given: Float[Array, "given columns"]
+    """Points to start from in place of random ones."""
     seed: Int[Array, ""]
 
 
-def _origin(
-    problem: Problem, bounds: Bounds, seed: int, initial: Float[np.ndarray, "given dof 10"] | None
-) -> _Origin:
-    given = jnp.zeros((0, 10 * problem.dof))
+def _origin(problem: Problem, seed: int, initial: Float[np.ndarray, "given dof 10"] | None) -> _Origin:
+    given = jnp.zeros((0, len(problem.free)))
     if initial is not None:
         if initial.shape[1:] != (problem.dof, 10):
             raise InputError(
                 f"initial parameters: expected shape (n, {problem.dof}, 10), got {initial.shape}"
             )
-        given = jax.jit(jax.vmap(jax.vmap(_coordinates)))(jnp.asarray(initial)).reshape(len(initial), -1)
-    return _Origin(problem, jnp.asarray(bounds.mass.mean(-1)), given, jnp.asarray(seed))
+        given = jax.jit(jax.vmap(_given_start, in_axes=(None, 0)))(problem, jnp.asarray(initial))
+    return _Origin(problem, given, jnp.asarray(seed))
 
 
 def _start(origin: _Origin, number: Int[Array, ""]) -> Float[Array, " columns"]:
-    """A given point where there is one of this number, else a random point of the box."""
-    problem, given = origin.problem, origin.given
-    x0 = _random_start(problem, origin.middling, jax.random.fold_in(jax.random.key(origin.seed), number))
-    if not len(given):
-        return x0
-    replaced = x0.at[: given.shape[1]].set(given[jnp.minimum(number, len(given) - 1)])
-    return jnp.where(number < len(given), jnp.clip(replaced, problem.lower, problem.upper), x0)
+    """A given point where there is one of this number, else a random one."""
+    given = origin.given
+    x0 = _random_start(origin.problem, jax.random.fold_in(jax.random.key(origin.seed), number))
+    return (
+        jnp.where(number < len(given), given[jnp.minimum(number, len(given) - 1)], x0) if len(given) else x0
+    )
 
 
-def _solve_starts(origin: _Origin, numbers: Int[Array, " chunk"], rounds: int, iterations: int) -> "Outcome":
+def _solve_starts(
+    origin: _Origin, numbers: Int[Array, " chunk"], iterations: int, tolerance: float
+) -> "Outcome":
     x0 = jax.vmap(lambda number: _start(origin, number))(numbers)
-    return solve_chunk(origin.problem, x0, rounds=rounds, iterations=iterations)
+    share = jnp.where(numbers < PRECISE, jnp.minimum(tolerance, _PRECISION), tolerance)
+    return solve_chunk(origin.problem, x0, iterations=iterations, tolerance=share)
 
 
-def _random_start(
-    problem: Problem, middling: Float[Array, " dof"], key: Key[Array, ""]
+def _random_start(problem: Problem, key: Key[Array, ""]) -> Float[Array, " columns"]:
+    r"""Mass and centre of mass uniform in their boxes, the total mass in its own; Sigma Wishart, of the size that
+    suits the mass."""
+    dof = problem.dof
+    drawn = jax.random.uniform(
+        key, (10 * dof + 1,), minval=jnp.finfo(float).tiny
+    )  # one draw: quick to compile
+    between = lambda box, share: box[..., 0] + (box[..., 1] - box[..., 0]) * share
+    mass = between(problem.mass_box, drawn[:dof])
+    com = between(problem.com_box, drawn[dof : 4 * dof].reshape(dof, 3))
+    normal = jax.scipy.special.ndtri(drawn[4 * dof : 10 * dof]).reshape(dof, 6)
+    L = jnp.zeros((dof, 3, 3)).at[:, _ROW, _COLUMN].set(0.5 * normal)
+    Sigma = mass[:, None, None] * (L @ jnp.swapaxes(L, 1, 2))
+    return _interior(problem, mass, com, Sigma, 0.1, drawn[-1])
+
+
+def _given_start(problem: Problem, phi: Float[Array, "dof 10"]) -> Float[Array, " columns"]:
+    """The real body inside the boxes that is near to a given one."""
+    mass, com, I_com = jax.vmap(inertia.to_com)(phi)
+    values, vectors = jnp.linalg.eigh(jax.vmap(inertia.second_moment)(I_com))
+    Sigma = (vectors * jnp.maximum(values, 0.0)[:, None]) @ jnp.swapaxes(vectors, 1, 2)
+    unit, length = problem.unit[:, 0], problem.unit[:, 1:]
+    mass = jnp.clip(mass / unit, *problem.mass_box.T)
+    com = jnp.clip((com - problem.centre) / length, problem.com_box[..., 0], problem.com_box[..., 1])
+    return _interior(problem, mass, com, Sigma / (unit * problem.unit[:, 1] ** 2)[:, None, None], 0.005, None)
+
+
+def _interior(
+    problem: Problem,
+    mass: Float[Array, " dof"],
+    com: Float[Array, "dof 3"],
+    Sigma: Float[Array, "dof 3 3"],
+    share: float,
+    of_total: Float[Array, ""] | None,
 ) -> Float[Array, " columns"]:
-    """Mass and centre of mass uniform in their boxes; L normal, of the size that suits the mass."""
-    of_box, of_L = jax.random.split(key)
-    links = 10 * problem.dof
-    lower, upper, scale = (x[:links].reshape(-1, 10) for x in (problem.lower, problem.upper, problem.scale))
-    boxes = jax.random.uniform(of_box, (problem.dof, 4), minval=lower[:, :4], maxval=upper[:, :4])
-    L = (
-        0.5
-        * jax.random.normal(of_L, (problem.dof, 6))
-        * scale[:, 4:]
-        * jnp.sqrt(boxes[:, :1] / middling[:, None])
-    )
-    extra = jnp.clip(jnp.zeros_like(problem.scale[links:]), problem.lower[links:], problem.upper[links:])
-    return jnp.concatenate([jnp.concatenate([boxes, L], -1).ravel(), extra])
+    """Coordinates of scaled bodies, moved into the boxes by a share of the way to their middles.
 
-
-# One link's coordinates x = (m, c, L) and what follows from them.
-
-
-def _second_moment(x: Float[Array, "10"]) -> Float[Array, "3 3"]:
-    L = jnp.zeros((3, 3), x.dtype).at[_ROW, _COLUMN].set(x[4:])
-    return L @ L.T + _TRIANGLE_INSET * jnp.eye(3)
-
-
-def _phi_and_inertia(x: Float[Array, "10"]) -> Float[Array, "16"]:
-    """`phi`, then xx, yy, zz, xy, xz, yz of the inertia about the centre of mass."""
-    I_com = inertia.inertia(_second_moment(x))
-    return jnp.concatenate([inertia.from_com(x[0], x[1:4], I_com), I_com[XYZ_ROW, XYZ_COLUMN]])
-
-
-def _coordinates(phi: Float[Array, "10"]) -> Float[Array, "10"]:
-    """x of a given body; the nearest real one where it is none."""
-    mass, com, I_com = inertia.to_com(phi)
-    values, vectors = jnp.linalg.eigh(inertia.second_moment(I_com))
-    Sigma = (vectors * jnp.maximum(values - _TRIANGLE_INSET, 1e-12)) @ vectors.T
-    return jnp.concatenate([mass[None], com, jnp.linalg.cholesky(Sigma)[_ROW, _COLUMN]])
-
-
-def _curvature(x: Float[Array, "10"], Gamma: Float[Array, "3 3"]) -> Float[Array, "10 10"]:
-    """Second derivatives of the objective along a link's coordinates, given its gradient in Sigma."""
-    of_L = 2 * _SAME_COLUMN * Gamma[_ROW][:, _ROW]
-    return jnp.zeros((10, 10), x.dtype).at[1:4, 1:4].set(2 * x[0] * Gamma).at[4:, 4:].set(of_L)
-
-
-def _gradient_in_Sigma(of_I: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Chain rule through I = tr(Sigma) 1 - Sigma."""
-    return jnp.trace(of_I) * jnp.eye(3) - of_I
-
-
-def _positive_part(S: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The nearest positive semidefinite matrix, by Jacobi rotations: faster in a batch than LAPACK."""
-    V = jnp.eye(3, dtype=S.dtype)
-    for _ in range(4):
-        for p, q in ((0, 1), (0, 2), (1, 2)):
-            angle = 0.5 * jnp.arctan2(2 * S[p, q], S[q, q] - S[p, p])
-            c, s = jnp.cos(angle), jnp.sin(angle)
-            R = jnp.eye(3, dtype=S.dtype).at[[p, q, p, q], [p, q, q, p]].set(jnp.stack([c, c, s, -s]))
-            S, V = R.T @ S @ R, V @ R
-    return (V * jnp.maximum(jnp.diagonal(S), 0)) @ V.T
-
-
-def _symmetric(xyz: Float[Array, "6"]) -> Float[Array, "3 3"]:
-    """The matrix G with <G, I> = xyz . (Ixx, Iyy, Izz, Ixy, Ixz, Iyz)."""
-    xx, yy, zz, xy, xz, yz = xyz
-    return jnp.array([[xx, xy / 2, xz / 2], [xy / 2, yy, yz / 2], [xz / 2, yz / 2, zz]])
-
-
-# Constraints other than boxes on the coordinates: margins, and the squared hinge with multipliers.
-
-
-class _Margins(eqx.Module):
-    """Margins, multipliers or hinges of all constraints, in this order everywhere."""
-
-    inertia: Float[Array, "dof 6 2"]
-    total: Float[Array, " 2"]
-    user: Float[Array, " user"]
-
-
-def _links(problem: Problem, x: Float[Array, " columns"], of_I: Float[Array, "dof 6"]) -> Links:
-    link = x[: 10 * problem.dof].reshape(-1, 10)
-    return Links(link[:, 0], link[:, 1:4], jax.vmap(lambda six: six[XYZ_MATRIX])(of_I))
-
-
-def _user_margins(problem: Problem, links: Links) -> Float[Array, " user"]:
-    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(c(links)) for c in problem.constraints)])
-
-
-def _margins(problem: Problem, links: Links, of_I: Float[Array, "dof 6"]) -> _Margins:
-    total = jnp.sum(links.mass)
-    return _Margins(
-        inertia=jnp.stack([of_I - problem.inertia[..., 0], problem.inertia[..., 1] - of_I], -1),
-        total=jnp.stack([total - problem.total_mass[0], problem.total_mass[1] - total]),
-        user=_user_margins(problem, links),
-    )
-
-
-def _hinges(margins: _Margins, multipliers: _Margins, weight: Float[Array, ""]) -> _Margins:
-    """Pressure of each constraint: not negative, zero where it is amply satisfied."""
-    return jax.tree.map(lambda g, y: jnp.maximum(0.0, y + weight * (_MARGIN_INSET - g)), margins, multipliers)
+    `of_total`: where in its box to bring the total mass, 0 to 1; None only moves it inside.
+    """
+    towards = lambda x, box: x + share * (box.mean(-1) - x)
+    mass, com = towards(mass, problem.mass_box), towards(com, problem.com_box)
+    unit = problem.unit[:, 0]
+    least, most = problem.mass_box.T + share * (problem.mass_box.mean(-1) - problem.mass_box.T)
+    total, ends = mass @ unit, jnp.stack([least @ unit, most @ unit])
+    low, high = jnp.maximum(problem.total_box[0], ends[0]), jnp.minimum(problem.total_box[1], ends[1])
+    inside = jnp.stack([low, high]) + share * 0.5 * (high - low) * jnp.array([1.0, -1.0])
+    wanted = jnp.clip(total, *inside)
+    if of_total is not None:
+        bounded = jnp.isfinite(problem.total_box).any()
+        wanted = jnp.where(bounded, inside[0] + of_total * (inside[1] - inside[0]), wanted)
+    up = wanted > total
+    end = jnp.where(up, most, least)
+    way = (wanted - total) / jnp.where(end @ unit == total, 1.0, end @ unit - total)
+    mass = mass + way * (end - mass)
+    m = mass[:, None, None]
+    Sigma = Sigma + (2 * share * m + problem.shift[:, None, None]) * jnp.eye(3)
+    S = jnp.concatenate([Sigma + m * com[:, :, None] * com[:, None], m * com[:, :, None]], 2)
+    S = jnp.concatenate([S, jnp.concatenate([m * com[:, None], m], 2)], 1)
+    low, high = problem.extra_box.T
+    width = jnp.where(jnp.isfinite(high - low), high - low, 1.0)
+    extra = jnp.clip(0.0, low + 0.5 * share * width, high - 0.5 * share * width)
+    u = jnp.stack([S[:, i, k] for i, k in small.PAIRS], 1)
+    return jnp.concatenate([u.ravel(), extra])
 
 
 def largest_violation(problem: Problem, phi: Float[Array, "dof 10"]) -> Float[Array, ""]:
     """The largest amount by which anything is missed; from `phi` alone, as any other program would see it."""
     links = Links.from_phi(phi)
     of_I = links.I_com[:, XYZ_ROW, XYZ_COLUMN]
-    margins = _margins(problem, links, of_I)
-    boxes = [
-        (value - box[..., 0], box[..., 1] - value)
-        for value, box in ((links.mass, problem.mass), (links.com, problem.com))
-    ]
-    least = jnp.stack([jnp.min(leaf, initial=jnp.inf) for leaf in jax.tree.leaves((margins, boxes))])
-    least = jnp.minimum(jnp.min(least), jnp.min(triangle_inequality(links)))
-    return jnp.where(jnp.isfinite(phi).all(), jnp.maximum(0.0, -least), jnp.inf)
-
-
-# The iteration.
-
-
-class _State(eqx.Module):
-    x: Float[Array, " columns"]
-    value: Float[Array, ""]
-    residual: Float[Array, " rows"]
-    damping: Float[Array, ""]
-    accepted: Int[Array, ""]
-
-
-def _evaluate(
-    problem: Problem, x: Float[Array, " columns"], multipliers: _Margins, weight: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, " rows"]]:
-    """Scaled objective with the constraints' penalty, and the residual."""
-    links = 10 * problem.dof
-    both = jax.vmap(_phi_and_inertia)(x[:links].reshape(-1, 10))
-    residual = problem.A @ jnp.concatenate([both[:, :10].ravel(), x[links:]]) - problem.b
-    hinges = _hinges(_margins(problem, _links(problem, x, both[:, 10:]), both[:, 10:]), multipliers, weight)
-    return residual @ residual + _sum_squares(hinges) / (2 * weight), residual
-
-
-def _sum_squares(tree: _Margins) -> Float[Array, ""]:
-    return sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), start=jnp.zeros(()))
-
-
-def _quadratic_model(
-    problem: Problem, state: _State, multipliers: _Margins, weight: Float[Array, ""]
-) -> tuple[Float[Array, " columns"], Float[Array, "columns columns"]]:
-    """Gradient and positive semidefinite Hessian in x."""
-    n, dof = 10 * problem.dof, problem.dof
-    each = jnp.arange(dof)
-    x = state.x[:n].reshape(-1, 10)
-    both, jacobian = jax.vmap(lambda x: (_phi_and_inertia(x), jax.jacfwd(_phi_and_inertia)(x)))(x)
-    D, E, of_I = jacobian[:, :10], jacobian[:, 10:], both[:, 10:]
-    links = _links(problem, state.x, of_I)
-    hinges = _hinges(_margins(problem, links, of_I), multipliers, weight)
-    # Gradients with respect to the quantities that x determines: phi, then I_com and the mass directly.
-    of_A = 2 * problem.A.T @ state.residual
-    of_phi = of_A[:n].reshape(-1, 10)
-    pressure = hinges.inertia[..., 1] - hinges.inertia[..., 0]
-    gradient = jnp.einsum("lja,lj->la", D, of_phi) + jnp.einsum("lja,lj->la", E, pressure)
-    gradient = gradient.at[:, 0].add(hinges.total[1] - hinges.total[0])
-    of_inertia = jax.vmap(_of_inertia)(of_phi[:, 4:]) + jax.vmap(_symmetric)(pressure)
-    # Gauss-Newton part of the data and of the boxes.
-    QD = jnp.einsum("nlj,ljb->nlb", problem.Q[:, :n].reshape(-1, dof, 10), D)
-    H_links = jnp.einsum("lja,ljmb->lamb", D, QD[:n].reshape(dof, 10, dof, 10))
-    pressed = weight * jnp.sum(hinges.inertia > 0, -1)
-    H_links = H_links.at[each, :, each].add(jnp.einsum("lja,lj,ljb->lab", E, pressed, E))
-    H_links = H_links.at[:, 0, :, 0].add(weight * jnp.sum(hinges.total > 0))
-    if problem.constraints:
-        jac = jax.jacrev(lambda links: _user_margins(problem, links))(links)
-        of_I_user = 0.5 * (jac.I_com + jnp.swapaxes(jac.I_com, -1, -2))
-        six = of_I_user[..., XYZ_ROW, XYZ_COLUMN] * jnp.array([1, 1, 1, 2, 2, 2])
-        J = jnp.concatenate([jac.mass[..., None], jac.com, jnp.zeros((*jac.mass.shape, 6))], -1)
-        J = J + jnp.einsum("klj,lja->kla", six, E)
-        gradient = gradient - jnp.einsum("k,kla->la", hinges.user, J)
-        of_inertia = of_inertia - jnp.einsum("k,klij->lij", hinges.user, of_I_user)
-        H_links = H_links + weight * jnp.einsum("kla,k,kmb->lamb", J, hinges.user > 0, J)
-    Gamma = jax.vmap(lambda G: _positive_part(_gradient_in_Sigma(G)))(of_inertia)
-    H_links = H_links.at[each, :, each].add(jax.vmap(_curvature)(x, Gamma)).reshape(n, n)
-    coupling = QD[n:].reshape(-1, n)
-    H = jnp.block([[H_links, coupling.T], [coupling, problem.Q[n:, n:]]])
-    return jnp.concatenate([gradient.ravel(), of_A[n:]]), H
-
-
-def _bend(
-    problem: Problem, x: Float[Array, " columns"], velocity: Float[Array, " columns"]
-) -> Float[Array, " columns"]:
-    r"""Gradient $D^\top 2A^\top A\,\phi''(v, v)$ that a straight step in x meets because phi is curved in x.
-
-    References:
-        Transtrum and Sethna, "Geodesic acceleration and the small-curvature approximation", 2012.
-    """
-    columns = lambda x: _columns(problem, x)
-    along = lambda x: jax.jvp(columns, (x,), (velocity,))[1]
-    second = jax.jvp(along, (x,), (velocity,))[1]
-    return jax.vjp(columns, x)[1](problem.Q @ second)[0]
-
-
-def _columns(problem: Problem, x: Float[Array, " columns"]) -> Float[Array, " columns"]:
-    """What A multiplies: phi of every link, then the extra unknowns."""
-    n = 10 * problem.dof
-    return jnp.concatenate([jax.vmap(_phi_and_inertia)(x[:n].reshape(-1, 10))[:, :10].ravel(), x[n:]])
-
-
-def _of_inertia(of_six: Float[Array, "6"]) -> Float[Array, "3 3"]:
-    """The matrix G with <G, I> = of_six . (Ixx, Ixy, Iyy, Ixz, Iyz, Izz), the kernels' order."""
-    return 0.5 * (inertia.symmetric(of_six) + jnp.diag(jnp.diagonal(inertia.symmetric(of_six))))
-
-
-def _step(problem: Problem, state: _State, multipliers: _Margins, weight: Float[Array, ""]) -> _State:
-    """One damped Newton step, kept if it lowers the objective."""
-    gradient, H = _quadratic_model(problem, state, multipliers, weight)
-    H = H * problem.scale[:, None] * problem.scale
-    held = ((state.x <= problem.lower) & (gradient > 0)) | ((state.x >= problem.upper) & (gradient < 0))
-    damped = jnp.where(held[:, None] | held, 0, H) + jnp.diag(jnp.where(held, 1.0, state.damping))
-    factor = jnp.linalg.cholesky(damped)
-    solve = lambda g: -jax.scipy.linalg.cho_solve((factor, True), jnp.where(held, 0, g * problem.scale))
-    step = solve(gradient)
-    bend = 0.5 * solve(_bend(problem, state.x, step * problem.scale))
-    most = _MOST_BEND * jnp.linalg.norm(step)
-    step = step + bend * jnp.minimum(1.0, most / jnp.maximum(jnp.linalg.norm(bend), 1e-300))
-    x = jnp.clip(state.x + step * problem.scale, problem.lower, problem.upper)
-    taken = (x - state.x) / problem.scale
-    expected = -((gradient * problem.scale) @ taken + 0.5 * taken @ (H @ taken))
-    value, residual = _evaluate(problem, x, multipliers, weight)
-    better = value < state.value  # false for what is not a number
-    gain = (state.value - value) / jnp.where(expected > 0, expected, 1.0)
-    factor = jnp.where(gain > 0.75, 0.125, jnp.where(gain < 0.25, 4.0, 1.0))
-    damping = state.damping * jnp.where(better, factor, 8.0)
-    pick = lambda new, old: jnp.where(better, new, old)
-    return _State(
-        x=pick(x, state.x),
-        value=pick(value, state.value),
-        residual=pick(residual, state.residual),
-        damping=jnp.clip(damping, 1e-12, 1e6),
-        accepted=state.accepted + better,
+    total = jnp.sum(links.mass)
+    boxes = (
+        (links.mass, problem.mass),
+        (links.com, problem.com),
+        (of_I, problem.inertia),
+        (total, problem.total_mass),
     )
+    margins = [margin for value, box in boxes for margin in (value - box[..., 0], box[..., 1] - value)]
+    margins += [constraint(links) for constraint in problem.constraints]
+    margins += [triangle_inequality(links)]
+    least = jnp.min(jnp.stack([jnp.min(margin, initial=jnp.inf) for margin in margins]))
+    return jnp.where(jnp.isfinite(phi).all(), jnp.maximum(0.0, -least), jnp.inf)
 
 
 class Outcome(eqx.Module):
@@ -580,41 +508,28 @@ def solve_chunk(
     problem: Problem,
     x0: Float[Array, "starts columns"],
     *,
-    rounds: int = ROUNDS,
     iterations: int = ITERATIONS,
+    tolerance: float | Float[Array, " starts"] = TOLERANCE,
+    lanes: int | None = None,
 ) -> Outcome:
-    """Minimise from every point of `x0`; a pure function to be compiled, no start knows of another."""
-    run = jax.vmap(lambda x0: _run_one(problem, x0, rounds, iterations))
-    return Outcome(*run(x0))
+    """Minimise from every point of `x0`; a pure function to be compiled, no start knows of another.
 
+    `lanes` of them (a quarter when None) take a few steps at a time, those that have taken the fewest first:
+    what is done costs nothing more, and no start waits for the slowest.
+    """
+    lanes = max(_LEAST_LANES, len(x0) // 4) if lanes is None else lanes
+    lanes, n = min(lanes, len(x0)), 10 * problem.dof
+    left = lambda state: ~state.done & (state.steps < iterations)
 
-def _run_one(problem: Problem, x0: Float[Array, " columns"], rounds: int, iterations: int):
-    """One start: Newton steps in rounds, with the multipliers updated after each."""
-    n = 10 * problem.dof
-    of_I = jax.vmap(_phi_and_inertia)(x0[:n].reshape(-1, 10))[:, 10:]
-    multipliers = jax.tree.map(jnp.zeros_like, _margins(problem, _links(problem, x0, of_I), of_I))
+    def go_on(state: interior.State) -> interior.State:
+        chosen = jnp.argsort(jnp.where(left(state), state.steps, iterations + 1))[:lanes]
+        part = jax.tree.map(lambda leaf: leaf[..., chosen], state)
+        part = jax.lax.fori_loop(0, _SEGMENT, lambda _, part: interior.step(problem, part, iterations), part)
+        return jax.tree.map(lambda whole, new: whole.at[..., chosen].set(new), state, part)
 
-    fresh = jnp.asarray(_DAMPING, x0.dtype)
-
-    def one_round(carry, weight):
-        state, multipliers = carry
-        value, residual = _evaluate(problem, state.x, multipliers, weight)
-        state = eqx.tree_at(lambda s: (s.value, s.residual, s.damping), state, (value, residual, fresh))
-
-        def body(state, _):
-            state = _step(problem, state, multipliers, weight)
-            return state, state.value
-
-        state, values = jax.lax.scan(body, state, None, length=iterations)
-        of_I = jax.vmap(_phi_and_inertia)(state.x[:n].reshape(-1, 10))[:, 10:]
-        margins = _margins(problem, _links(problem, state.x, of_I), of_I)
-        return (state, _hinges(margins, multipliers, weight)), values
-
-    state = _State(x0, jnp.zeros(()), jnp.zeros_like(problem.b), fresh, jnp.zeros((), int))
-    weights = _WEIGHT * 10.0 ** jnp.arange(rounds)
-    (state, _), values = jax.lax.scan(one_round, (state, multipliers), weights)
-    phi = jax.vmap(_phi_and_inertia)(state.x[:n].reshape(-1, 10))[:, :10]
-    violation = largest_violation(problem, phi)
-    late = values[-1, iterations // 2] - values[-1, -1]
-    settled = late <= 1e-3 * values[-1, -1] + 1e-12 * problem.b @ problem.b
-    return phi, state.x[n:], violation, settled & (violation == 0), state.accepted
+    state = interior.initialise(problem, x0.T, jnp.broadcast_to(jnp.asarray(tolerance, float), len(x0)))
+    state = jax.lax.while_loop(lambda state: jnp.any(left(state)), go_on, state)
+    phi = jnp.einsum("lpq,lqb->blp", problem.to_phi, state.u[:n].reshape(problem.dof, 10, -1))
+    violation = jax.vmap(lambda phi: largest_violation(problem, phi))(phi)
+    extra = (state.u[n:] * problem.extra_unit[:, None]).T
+    return Outcome(phi, extra, violation, state.done & (violation == 0), state.accepted)

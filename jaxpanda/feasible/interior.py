@@ -1,0 +1,413 @@
+r"""Interior-point steps of many starts at once: arrays with the starts ("lanes") last and contiguous.
+
+$$\min_u\ \lVert Au - b\rVert^2 + P(u) \quad\text{subject to}\quad S_l(u) \succ 0,\quad s(u) = Gu + d > 0$$
+
+$S_l$ is link $l$'s pseudo-inertia (linear in $u$), $G$ holds the boxes and the total mass, $P$ the augmented
+Lagrangian of whatever is not linear in $u$: boxes on inertias about the centre of mass, and the user's.
+
+**Path.** Primal and dual, $S Z = \mu 1$ and $s z = \mu$, with
+
+$$\nabla(\lVert Au-b\rVert^2 + P) + \mu\,\nabla\bigl(B(u) - \langle\nabla B(u_0), u\rangle\bigr) = 0,
+\qquad B = -\textstyle\sum\log\det S_l - \sum\log s + \tfrac{\kappa}{2}\lVert u\rVert^2 .$$
+
+The term in the start $u_0$ makes $u_0$ the path's own beginning ($\mu \to \infty$) and its end, of all optimal
+$u$, the one nearest to $u_0$ in the barrier's Bregman distance: where the optimum is not unique, the ends differ
+as the starts do.
+
+**Step.** Predictor and corrector (Mehrotra 1992) along the direction of Helmberg, Rendl, Vanderbei, Wolkowicz
+(1996) and Kojima, Shindoh, Hara (1997): its matrix, $\mathrm{tr}(E_q S^{-1} E_r Z)$, needs no eigenvalues. $P$
+enters by its Gauss-Newton matrix; a step that raises the objective by more than the duality gap is shortened,
+else taken back and damped (Levenberg).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from . import small
+from .constraints import Constraint, Links
+
+# Where m, h and Sigma stand among the ten entries of a link's scaled pseudo-inertia, `small.PAIRS`.
+MASS = small.PAIRS.index((3, 3))
+FIRST = [small.PAIRS.index((k, 3)) for k in range(3)]
+XYZ_ROW = np.array([0, 1, 2, 0, 0, 1])
+XYZ_COLUMN = np.array([0, 1, 2, 1, 2, 2])
+XYZ_MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+"""The order xx, yy, zz, xy, xz, yz of tables."""
+PER_LINK = 8
+"""Linear constraints of a link: its mass and its centre of mass, from below and above."""
+
+_MARGIN_INSET = 1e-6  # in the constraint's own unit
+_TO_BOUNDARY = 0.95
+_LEAST_DAMPING = 1e-12
+_NEARNESS = 100.0  # kappa: how much an end resembles its start, where the optimum leaves that open
+_MOST_WEIGHT = 1e6  # as a multiple of the first
+_SHORTER = (1.0, 0.5, 0.2, 0.05)
+_PATIENCE = 4  # steps between two updates of the multipliers
+
+
+class Problem(eqx.Module):
+    """One problem in scaled form; unknowns u: ten entries of each link's S, then the extra unknowns."""
+
+    A: Float[Array, "rows columns"]
+    """Scaled so that the Hessian's diagonal is about one."""
+    b: Float[Array, " rows"]
+    Q: Float[Array, "columns columns"]
+    """2 AᵀA."""
+    G: Float[Array, "linear columns"]
+    """Rows: eight a link, two of the total mass, the extra unknowns' lower and upper. What is absent is zero."""
+    d: Float[Array, " linear"]
+    free: Float[Array, " columns"]
+    """1.0, or 0.0 where a box is a point."""
+    to_phi: Float[Array, "dof 10 10"]
+    """From u of a link to phi."""
+    shift: Float[Array, " dof"]
+    """Subtracted from the diagonal of Sigma in S: how far from the boundary to stay."""
+    unit: Float[Array, "dof 2"]
+    """Unit of mass [kg] and length [m] of each link."""
+    centre: Float[Array, "dof 3"]
+    """Origin of a link's h and Sigma: the middle of the box of its centre of mass [m]."""
+    extra_unit: Float[Array, " extra"]
+    mass: Float[Array, "dof 2"]
+    com: Float[Array, "dof 3 2"]
+    inertia: Float[Array, "dof 6 2"]
+    total_mass: Float[Array, " 2"]
+    mass_box: Float[Array, "dof 2"]
+    """Scaled, as G holds them; for the starts."""
+    com_box: Float[Array, "dof 3 2"]
+    total_box: Float[Array, " 2"]
+    """[kg]"""
+    extra_box: Float[Array, "extra 2"]
+    constraints: tuple[Constraint, ...] = eqx.field(static=True)
+    dof: int = eqx.field(static=True)
+    boxed: bool = eqx.field(static=True)
+    """Whether any inertia is bounded by more than the triangle inequality."""
+
+
+class Multipliers(eqx.Module):
+    """Of the constraints that are not linear, or their margins or hinges."""
+
+    inertia: Float[Array, "dof 6 2 lanes"]
+    user: Float[Array, "user lanes"]
+
+
+class State(eqx.Module):
+    u: Float[Array, "columns lanes"]
+    start: Float[Array, "columns lanes"]
+    tolerance: Float[Array, " lanes"]
+    Z: Float[Array, "dof 4 4 lanes"]
+    z: Float[Array, "linear lanes"]
+    pull: Float[Array, "columns lanes"]
+    """The barrier's gradient at the start, negative."""
+    pulled: Float[Array, " lanes"]
+    """What it is weighed with at present: the path's mu, on the path."""
+    multipliers: Multipliers
+    weight: Float[Array, " lanes"]
+    missed: Float[Array, " lanes"]
+    """Largest violation of the constraints that are not linear, at the last update of their multipliers."""
+    waited: Int[Array, " lanes"]
+    damping: Float[Array, " lanes"]
+    accepted: Int[Array, " lanes"]
+    steps: Int[Array, " lanes"]
+    done: Bool[Array, " lanes"]
+
+
+def matrices(problem: Problem, u: Float[Array, "columns lanes"]) -> small.Matrices:
+    """S of every link."""
+    inset = jnp.asarray(np.diag([1.0, 1.0, 1.0, 0.0]))[:, :, None] * problem.shift[:, None, None, None]
+    return small.symmetric(_of_links(problem, u)) - inset
+
+
+def _of_links(problem: Problem, u: Float[Array, "columns lanes"]) -> Float[Array, "dof 10 lanes"]:
+    return u[: 10 * problem.dof].reshape(problem.dof, 10, -1)
+
+
+def _second_moment(link: Float[Array, "dof 10 lanes"]) -> list[list[Array]]:
+    """Scaled Sigma about the centre of mass: entry by entry, lower triangle included."""
+    at = lambda i, k: link[:, small.PAIRS.index((min(i, k), max(i, k)))]
+    return [[at(i, k) - at(i, 3) * at(k, 3) / at(3, 3) for k in range(3)] for i in range(3)]
+
+
+def _inertia_entries(link: Float[Array, "dof 10 lanes"]) -> Float[Array, "dof 6 lanes"]:
+    """Scaled xx, yy, zz, xy, xz, yz of the inertia about the centre of mass."""
+    Sigma = _second_moment(link)
+    trace = Sigma[0][0] + Sigma[1][1] + Sigma[2][2]
+    return jnp.stack(
+        [(trace if i == k else 0.0) - Sigma[i][k] for i, k in zip(XYZ_ROW, XYZ_COLUMN, strict=True)], 1
+    )
+
+
+def links_of(problem: Problem, u: Float[Array, " columns"]) -> Links:
+    """One lane's links in SI units."""
+    link = _of_links(problem, u[:, None])
+    size = problem.unit[:, 0] * problem.unit[:, 1] ** 2
+    six = _inertia_entries(link)[..., 0] * size[:, None]
+    h = jnp.stack([link[:, k, 0] for k in FIRST], 1)
+    m = link[:, MASS]
+    com = problem.centre + problem.unit[:, 1:] * h / m
+    return Links(problem.unit[:, 0] * m[:, 0], com, six[:, XYZ_MATRIX])
+
+
+def _margins(problem: Problem, u: Float[Array, "columns lanes"]) -> Multipliers:
+    """Margins of the constraints that are not linear, in their own units."""
+    lanes = u.shape[1]
+    inertia = jnp.zeros((problem.dof, 6, 0, lanes), u.dtype)
+    if problem.boxed:
+        size = problem.unit[:, 0] * problem.unit[:, 1] ** 2
+        six = _inertia_entries(_of_links(problem, u)) * size[:, None, None]
+        box = problem.inertia[..., None]
+        inertia = jnp.stack([six - box[:, :, 0], box[:, :, 1] - six], 2)
+    return Multipliers(inertia, jax.vmap(lambda u: _user_margins(problem, u), -1, -1)(u))
+
+
+def _user_margins(problem: Problem, u: Float[Array, " columns"]) -> Float[Array, " user"]:
+    if not problem.constraints:
+        return jnp.zeros(0, u.dtype)
+    links = links_of(problem, u)
+    return jnp.concatenate([jnp.ravel(constraint(links)) for constraint in problem.constraints])
+
+
+def _hinges(margins: Multipliers, multipliers: Multipliers, weight: Float[Array, " lanes"]) -> Multipliers:
+    """Pressure of each constraint: not negative, zero where it is amply satisfied."""
+    return jax.tree.map(lambda g, y: jnp.maximum(0.0, y + weight * (_MARGIN_INSET - g)), margins, multipliers)
+
+
+def _over_lanes(tree: Multipliers, of: Callable, initial: float) -> Float[Array, " lanes"]:
+    parts = [of(leaf.reshape(-1, leaf.shape[-1]), axis=0, initial=initial) for leaf in jax.tree.leaves(tree)]
+    return of(jnp.stack(parts), axis=0)
+
+
+class _Value(NamedTuple):
+    objective: Float[Array, " lanes"]
+    """Sum of squares and augmented Lagrangian."""
+    residual: Float[Array, "rows lanes"]
+    margins: Multipliers
+    hinges: Multipliers
+
+
+def _evaluate(problem: Problem, u: Float[Array, "columns lanes"], state: State) -> _Value:
+    residual = problem.A @ u - problem.b[:, None]
+    margins = _margins(problem, u)
+    hinges = _hinges(margins, state.multipliers, state.weight)
+    penalty = _over_lanes(jax.tree.map(jnp.square, hinges), jnp.sum, 0.0) / (2 * state.weight)
+    return _Value(jnp.sum(residual**2, 0) + penalty, residual, margins, hinges)
+
+
+def _model(problem: Problem, state: State, value: _Value):
+    """Gradient of the objective; its Hessian beyond Q, as blocks of the links and as rows of the user's."""
+    n = 10 * problem.dof
+    gradient = 2 * problem.A.T @ value.residual
+    blocks, rows = jnp.zeros(()), None
+    link = _of_links(problem, state.u)
+    if problem.boxed:
+        size = (problem.unit[:, 0] * problem.unit[:, 1] ** 2)[:, None, None]
+        along = lambda e: jax.jvp(_inertia_entries, (link,), (jnp.broadcast_to(e[:, None], link.shape),))[1]
+        E = (
+            jnp.moveaxis(jax.vmap(along)(jnp.eye(10, dtype=link.dtype)), 0, 2) * size[..., None]
+        )  # (dof, 6, 10, lanes)
+        E = jax.lax.optimization_barrier(E)
+        pressure = value.hinges.inertia[:, :, 1] - value.hinges.inertia[:, :, 0]
+        gradient = gradient.at[:n].add(jnp.sum(E * pressure[:, :, None], 1).reshape(n, -1))
+        pressed = state.weight * jnp.sum(value.hinges.inertia > 0, 2)
+        blocks = jnp.sum(E[:, :, :, None] * (E * pressed[:, :, None])[:, :, None], 1)
+    if problem.constraints:
+        J = jax.vmap(jax.jacrev(lambda u: _user_margins(problem, u)), -1, -1)(
+            state.u
+        )  # (user, columns, lanes)
+        gradient = gradient - jnp.sum(J * value.hinges.user[:, None], 0)
+        rows = J * jnp.sqrt(state.weight * (value.hinges.user > 0))[:, None]
+    return gradient, blocks, rows
+
+
+def _assemble(problem: Problem, blocks, ratio, rows, damping) -> Float[Array, "lanes columns columns"]:
+    """The step's matrix: lanes first, as the library's Cholesky wants them."""
+    n, dof, first = 10 * problem.dof, problem.dof, PER_LINK * problem.dof
+    lanes, columns = ratio.shape[1], len(problem.free)
+    each = np.arange(dof)
+    of_boxes = problem.G[:first, :n].reshape(dof, PER_LINK, dof, 10)[each, :, each]
+    squares = of_boxes[:, :, :, None] * of_boxes[:, :, None]
+    blocks = blocks + jnp.einsum("lcqr,lcb->lqrb", squares, ratio[:first].reshape(dof, PER_LINK, lanes))
+    blocks = jax.lax.optimization_barrier(jnp.moveaxis(blocks, -1, 0))
+    spread = (blocks[:, :, :, None] * jnp.eye(dof)[:, None, :, None]).reshape(lanes, n, n)
+    diagonal = jnp.broadcast_to(damping[:, None], (lanes, columns))
+    if columns > n:
+        spread = jnp.pad(spread, ((0, 0), (0, columns - n), (0, columns - n)))
+        diagonal = diagonal + ratio[first + 2 :].T @ problem.G[first + 2 :] ** 2
+    low, high = problem.G[first], problem.G[first + 1]
+    H = problem.Q + spread
+    H = (
+        H
+        + ratio[first][:, None, None] * (low[:, None] * low)
+        + ratio[first + 1][:, None, None] * (high[:, None] * high)
+    )
+    if rows is not None:
+        H = H + jnp.einsum("kqb,krb->bqr", rows, rows)
+    mask = problem.free[:, None] * problem.free
+    diagonal = diagonal * problem.free + (1 - problem.free)
+    return H * mask + diagonal[:, :, None] * jnp.eye(columns)
+
+
+def initialise(
+    problem: Problem, u: Float[Array, "columns lanes"], tolerance: Float[Array, " lanes"]
+) -> State:
+    """On the path's beginning."""
+    lanes = u.shape[1]
+    S_inverse = small.inverse(matrices(problem, u))
+    s = problem.G @ u + problem.d[:, None]
+    pull = problem.G.T @ (1 / s)
+    pull = pull.at[: 10 * problem.dof].add(small.adjoint(S_inverse).reshape(-1, lanes))
+    margins = _margins(problem, u)
+    fresh = jnp.zeros(lanes, int)
+    state = State(
+        u=u,
+        start=u,
+        tolerance=tolerance,
+        Z=S_inverse,
+        z=1 / s,
+        pull=pull,
+        pulled=jnp.ones(lanes),
+        multipliers=jax.tree.map(jnp.zeros_like, margins),
+        weight=jnp.broadcast_to(_weight(problem), lanes),
+        missed=jnp.full(lanes, jnp.inf),
+        waited=fresh,
+        damping=jnp.full(lanes, _LEAST_DAMPING),
+        accepted=fresh,
+        steps=fresh,
+        done=jnp.zeros(lanes, bool),
+    )
+    mu = _evaluate(problem, u, state).objective / _order(problem)
+    return eqx.tree_at(lambda s: (s.Z, s.z, s.pulled), state, (mu * state.Z, mu * state.z, mu))
+
+
+def _weight(problem: Problem) -> Float[Array, ""]:
+    """First weight of the constraints that are not linear: in proportion to an objective that is large."""
+    return jnp.maximum(1.0, jnp.sum(problem.b**2))
+
+
+def _order(problem: Problem) -> int:
+    """Of the barrier: the duality gap on the path is this many mu."""
+    return 4 * problem.dof + len(problem.d)
+
+
+def step(problem: Problem, state: State, most: int) -> State:
+    """One predictor-corrector step of every lane that is not done and has taken less than `most`."""
+    active = ~state.done & (state.steps < most)
+    n, order = 10 * problem.dof, _order(problem)
+    G, free = problem.G, problem.free[:, None]
+    S, s = matrices(problem, state.u), problem.G @ state.u + problem.d[:, None]
+    S_inverse = small.inverse(S)
+    gap = small.inner(S, state.Z) + jnp.sum(s * state.z, 0)
+    mu = gap / order
+    value = _evaluate(problem, state.u, state)
+    gradient, blocks, rows = _model(problem, state, value)
+    away = state.pull + _NEARNESS * (state.u - state.start)  # what the target's mu is multiplied with
+    unbalanced = gradient - G.T @ state.z + state.pulled * away
+    unbalanced = unbalanced.at[:n].add(-small.adjoint(state.Z).reshape(n, -1))
+    unbalanced = jnp.max(jnp.abs(unbalanced * free), 0)
+    pressed = _over_lanes(value.hinges, jnp.max, 0.0) > 0
+    blocks = blocks + small.curvature(S_inverse, state.Z)
+    # The next target is not known yet; a tenth of mu is about right.
+    nearness = 0.1 * _NEARNESS * mu
+    H = _assemble(problem, blocks, state.z / s, rows, state.damping + nearness)
+    factor = jax.lax.linalg.cholesky(H, symmetrize_input=False)
+
+    def solve(rhs: Float[Array, "columns lanes"]) -> Float[Array, "columns lanes"]:
+        x = (rhs * free).T[..., None]
+        for transpose in (False, True):
+            x = jax.lax.linalg.triangular_solve(factor, x, left_side=True, lower=True, transpose_a=transpose)
+        return x[..., 0].T
+
+    nothing_left = 1e-14 * jnp.sum(problem.b**2)
+    solved = state.tolerance * value.objective + nothing_left
+
+    def direction(corrects, before):
+        """Predictor, then the corrector: towards S Z = target 1, with the predictor's second order."""
+        _, dS, dZ, ds, dz, alpha, _, within_reach = before
+        alpha = _TO_BOUNDARY * alpha
+        left = small.inner(S + alpha * dS, state.Z + alpha * dZ)
+        left = left + jnp.sum((s + alpha * ds) * (state.z + alpha * dz), 0)
+        target = corrects * jnp.maximum(mu * jnp.clip((left / gap) ** 3, 1e-4, 1.0), 0.01 * solved / order)
+        of_S = target * S_inverse - small.symmetric_part(small.product(small.product(S_inverse, dS), dZ))
+        of_s = (target - ds * dz) / s
+        rhs = G.T @ of_s - gradient - target * away
+        du = solve(rhs.at[:n].add(small.adjoint(of_S).reshape(n, -1)))
+        dS, ds = small.symmetric(_of_links(problem, du)), G @ du
+        dZ = of_S - state.Z - small.symmetric_part(small.product(small.product(S_inverse, dS), state.Z))
+        dz = of_s - state.z - state.z / s * ds
+        dS, dZ = jax.lax.optimization_barrier((dS, dZ))
+        ratio = jnp.minimum(jnp.min(ds / s, 0), jnp.min(dz / state.z, 0))
+        longest = small.longest_step(jnp.concatenate([S, state.Z]), jnp.concatenate([dS, dZ]))
+        # The predictor aims at the optimum: what it would gain is how far that is.
+        gain = -jnp.sum(du * (gradient + 0.5 * problem.Q @ du), 0)
+        within_reach = jnp.where(corrects, within_reach, gain)
+        return du, dS, dZ, ds, dz, jnp.minimum(longest, 1 / jnp.maximum(1.0, -ratio)), target, within_reach
+
+    nothing = jax.tree.map(jnp.zeros_like, (state.u, S, S, s, s, gap, gap, gap))
+    du, _, dZ, _, dz, alpha, target, within_reach = jax.lax.fori_loop(0, 2, direction, nothing)
+    alpha = jnp.where(alpha < 1, _TO_BOUNDARY * alpha, 1.0)
+
+    # Where a constraint bends, the whole step may lead astray: the longest of a few that does not.
+    def objective(share: float) -> Float[Array, " lanes"]:
+        return _evaluate(problem, state.u + share * alpha * du, state).objective
+
+    if problem.boxed or problem.constraints:
+        fine = jnp.stack([objective(share) for share in _SHORTER]) <= value.objective + gap
+        alpha = alpha * jnp.asarray(_SHORTER)[jnp.argmax(fine, 0)]
+    u = state.u + alpha * du
+    new = _evaluate(problem, u, state)
+    better = new.objective <= value.objective + gap  # false for what is not a number
+    move = better & active
+    pick = lambda new, old: jnp.where(move, new, old)
+    Z, z = pick(state.Z + alpha * dZ, state.Z), pick(state.z + alpha * dz, state.z)
+    value = jax.tree.map(pick, new, value)
+    u = pick(u, state.u)
+    left = small.inner(matrices(problem, u), Z) + jnp.sum((G @ u + problem.d[:, None]) * z, 0)
+
+    # Constraints that are not linear: whether they hold, and whether their multipliers have settled.
+    missed = -jnp.minimum(0.0, _over_lanes(value.margins, jnp.min, jnp.inf))
+    slack = jax.tree.map(
+        lambda y, g: jnp.where(y > 0, y * jnp.abs(g - _MARGIN_INSET), 0.0), value.hinges, value.margins
+    )
+    unsettled = _over_lanes(slack, jnp.sum, 0.0)
+    solved = state.tolerance * value.objective
+    nothing_left = value.objective <= nothing_left
+    # What is unbalanced shrinks with the step where the objective is quadratic; elsewhere it is looked at again.
+    pressed = pressed | (_over_lanes(value.hinges, jnp.max, 0.0) > 0)
+    unbalanced = unbalanced * jnp.where(pressed | ~better, 1.0, 1 - alpha)
+    pulled = pick(state.pulled + alpha * (target - state.pulled), state.pulled)
+    within_reach = jnp.abs(within_reach) * jnp.maximum(pulled / state.pulled, left / gap)
+    close = (within_reach <= solved) & (left <= jnp.minimum(0.5 * value.objective, 300 * solved))
+    on_path = (close & (unbalanced <= 0.01 * jnp.sqrt(solved))) | nothing_left
+    done = state.done | (active & on_path & (missed <= 0) & ((unsettled <= solved) | nothing_left))
+    update = active & ((state.waited >= _PATIENCE) | on_path)
+    stuck = missed > 0.25 * state.missed
+    factor = jnp.where(stuck, 10.0, jnp.where(state.weight < 100 * _weight(problem), 3.0, 1.0))
+    heavier = jnp.minimum(factor * state.weight, _MOST_WEIGHT * _weight(problem))
+    return State(
+        u=u,
+        start=state.start,
+        tolerance=state.tolerance,
+        Z=Z,
+        z=z,
+        pull=state.pull,
+        pulled=pulled,
+        multipliers=jax.tree.map(
+            lambda new, old: jnp.where(update, new, old), value.hinges, state.multipliers
+        ),
+        weight=jnp.where(update, heavier, state.weight),
+        missed=jnp.where(update, missed, state.missed),
+        waited=jnp.where(update, 0, state.waited + 1),
+        damping=jnp.where(
+            better,
+            jnp.maximum(0.2 * state.damping, _LEAST_DAMPING),
+            jnp.clip(10 * state.damping, 1e-4, 1e12),
+        ),
+        accepted=state.accepted + move,
+        steps=state.steps + active,
+        done=done,
+    )
