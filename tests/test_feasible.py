@@ -334,4 +334,5 @@ def test_a_box_on_the_inertia_binds_where_it_should():
     bounds = Bounds(np.array([[1.0, 2.0]]), np.zeros((1, 3, 2)), box[None])
     found = solve(np.eye(10)[4:5], np.array([0.5]), bounds, starts=4)
     assert np.all(found.violation == 0)
-    np.testing.assert_allclose(found.objective, 0.16, rtol=1e-4)
+    assert found.objective[found.best] == pytest.approx(0.16, rel=1e-4)
+    assert np.all(found.objective < 1.03 * 0.16)
