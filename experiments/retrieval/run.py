@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import platform
+import resource
 import time
 from pathlib import Path
 
@@ -41,6 +42,13 @@ def timed(**options) -> tuple[Retrieval, float, float]:
     return found, time.perf_counter() - wall, time.process_time() - cpu
 
 
+def peak_memory() -> int:
+    """Bytes: of the accelerator where there is one, else of this process."""
+    statistics = jax.local_devices()[0].memory_stats() or {}
+    process = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return statistics.get("peak_bytes_in_use", process)
+
+
 def row(name: str, found: Retrieval, wall: float, cpu: float) -> dict:
     outcome = found.solutions
     feasible = outcome.violation == 0
@@ -49,7 +57,10 @@ def row(name: str, found: Retrieval, wall: float, cpu: float) -> dict:
         f"{name:28s} {found.starts:5d} starts  phi {found.objective:.4e}  "
         f"violation {found.max_violation:.1e}  feasible {feasible.mean():6.1%}  "
         f"within 1 % of the bound {near.mean():6.1%}  compile {found.compile_seconds:5.1f} s  "
-        f"run {found.run_seconds:5.1f} s  all {wall:5.1f} s ({cpu:.1f} s CPU)"
+        f"run {found.run_seconds:5.1f} s  all {wall:5.1f} s ({cpu:.1f} s CPU)\n"
+        f"{'':28s} {found.starts / found.run_seconds:.0f} starts/s, "
+        f"{near.sum() / found.run_seconds:.0f} of them within 1 % of the bound, without violation; "
+        f"peak memory so far {peak_memory() / 2**30:.2f} GiB"
     )
     return {
         "starts": found.starts,
@@ -57,7 +68,9 @@ def row(name: str, found: Retrieval, wall: float, cpu: float) -> dict:
         "max_violation": found.max_violation,
         "feasible": float(feasible.mean()),
         "within_1_percent": float(near.mean()),
+        "starts_per_second": found.starts / found.run_seconds,
         "starts_per_second_within_1_percent": float(near.sum() / found.run_seconds),
+        "peak_memory_bytes": peak_memory(),
         "seconds": {"compile": found.compile_seconds, "run": found.run_seconds, "wall": wall, "cpu": cpu},
     }
 
@@ -70,7 +83,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    print(f"{platform.machine()}, {os.cpu_count()} cores, JAX {jax.__version__} on {jax.default_backend()}")
+    print(
+        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
+        f"NumPy {np.__version__}, JAX {jax.__version__} on {jax.local_devices()[0].device_kind}"
+    )
 
     best, *seconds = timed(starts=options.starts, seed=options.seed, certificate=True)
     figures = {"smooth": row("feasible by construction", best, *seconds)}
