@@ -21,7 +21,7 @@ from jaxpanda.feasible import (
     triangle_inequality,
     when,
 )
-from jaxpanda.feasible.solver import scaled_problem, solve_chunk, starting_points
+from jaxpanda.feasible.convex import scaled_problem, solve_chunk, starting_points
 from jaxpanda.panda import panda
 
 
@@ -89,7 +89,7 @@ def test_extra_unknowns_stay_in_their_bounds(reachable):
 
 def test_the_same_seed_gives_the_same_starts_whatever_the_chunk():
     A, b = np.eye(10)[:1], np.array([5.0])
-    found = [solve(A, b, boxes(1), starts=6, chunk=chunk, iterations=3) for chunk in (6, 4)]
+    found = [solve(A, b, boxes(1), starts=6, chunk=chunk, rounds=1, iterations=1) for chunk in (6, 4)]
     for other in found[1:]:
         np.testing.assert_allclose(other.phi, found[0].phi, rtol=1e-9)
     assert len(np.unique(found[0].phi[:, 0, 3])) == 6
@@ -283,9 +283,16 @@ def test_the_longest_step_ends_at_the_boundary(bodies):
 def chunked(reachable):
     """The outcome of 40 starts when 40, and when 16 of them at a time, take their steps."""
     A, b, bounds, _ = reachable
-    problem = scaled_problem(A, b, bounds, (), np.array([0.3]), np.array([0.7]))
+    problem = scaled_problem(A, b, bounds, np.array([0.3]), np.array([0.7]))
     x0 = starting_points(problem, 40, 5)
-    return problem, x0, [jax.jit(lambda p, x, n=n: solve_chunk(p, x, lanes=n))(problem, x0) for n in (40, 16)]
+    return (
+        problem,
+        x0,
+        [
+            jax.jit(lambda p, x, n=n: solve_chunk(p, x, iterations=100, lanes=n))(problem, x0)
+            for n in (40, 16)
+        ],
+    )
 
 
 def test_starts_that_leave_when_done_end_where_they_would_have_ended(chunked):

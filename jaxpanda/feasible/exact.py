@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 from ..errors import InputError, require_x64
 from .bounds import Bounds
 from .constraints import Constraint, Links, triangle_inequality
-from .interior import XYZ_MATRIX, Problem
-from .solver import Solutions, largest_violation, scaled_problem
+from .newton import Problem, scaled_problem
+from .outcome import XYZ_MATRIX, largest_violation
+from .solver import Solutions
 
 STEPS = 10
 """The paper's kappa: how often the penalty is raised."""
@@ -105,8 +106,12 @@ def _penalised(z: Float[Array, " p"], args: tuple) -> Float[Array, ""]:
     problem, (A, b, boxes), xi = args
     links = _links(z, boxes)
     total = jnp.sum(links.mass)
-    margins = [triangle_inequality(links), total - problem.total_mass[:1], problem.total_mass[1:] - total]
-    margins += [jnp.ravel(constraint(links)) for constraint in problem.constraints]
+    margins = [
+        triangle_inequality(links),
+        total - problem.limits.total_mass[:1],
+        problem.limits.total_mass[1:] - total,
+    ]
+    margins += [jnp.ravel(constraint(links)) for constraint in problem.limits.constraints]
     missed = sum(jnp.sum(jnp.maximum(0.0, -margin)) for margin in margins)
     return jnp.sum((A @ links.phi.ravel() - b) ** 2) + xi * missed
 
@@ -131,6 +136,6 @@ def _run_chunk(problem: Problem, equations: tuple, keys: Array, steps: int, iter
         z, (done, count) = jax.lax.scan(raised, z, XI * jnp.arange(steps))
         links = _links(z, boxes)
         phi = jax.vmap(inertia.from_com)(links.mass, links.com, links.I_com)
-        return phi, largest_violation(problem, phi), done[-1], jnp.sum(count)
+        return phi, largest_violation(problem.limits, phi), done[-1], jnp.sum(count)
 
     return jax.vmap(one)(keys)

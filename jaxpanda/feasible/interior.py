@@ -3,7 +3,7 @@ r"""Interior-point steps of many starts at once: arrays with the starts ("lanes"
 $$\min_u\ \lVert Au - b\rVert^2 + P(u) \quad\text{subject to}\quad S_l(u) \succ 0,\quad s(u) = Gu + d > 0$$
 
 $S_l$ is link $l$'s pseudo-inertia (linear in $u$), $G$ holds the boxes and the total mass, $P$ the augmented
-Lagrangian of whatever is not linear in $u$: boxes on inertias about the centre of mass, and the user's.
+Lagrangian of what is not linear in $u$: boxes on inertias about the centre of mass.
 
 **Path.** Primal and dual, $S Z = \mu 1$ and $s z = \mu$, with
 
@@ -20,7 +20,6 @@ enters by its Gauss-Newton matrix; a step that raises the objective by more than
 else taken back and damped (Levenberg).
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -30,15 +29,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from . import small
-from .constraints import Constraint, Links
+from .outcome import XYZ_COLUMN, XYZ_ROW, Limits
 
 # Where m, h and Sigma stand among the ten entries of a link's scaled pseudo-inertia, `small.PAIRS`.
 MASS = small.PAIRS.index((3, 3))
 FIRST = [small.PAIRS.index((k, 3)) for k in range(3)]
-XYZ_ROW = np.array([0, 1, 2, 0, 0, 1])
-XYZ_COLUMN = np.array([0, 1, 2, 1, 2, 2])
-XYZ_MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
-"""The order xx, yy, zz, xy, xz, yz of tables."""
 PER_LINK = 8
 """Linear constraints of a link: its mass and its centre of mass, from below and above."""
 
@@ -62,8 +57,6 @@ class Problem(eqx.Module):
     G: Float[Array, "linear columns"]
     """Rows: eight a link, two of the total mass, the extra unknowns' lower and upper. What is absent is zero."""
     d: Float[Array, " linear"]
-    free: Float[Array, " columns"]
-    """1.0, or 0.0 where a box is a point."""
     to_phi: Float[Array, "dof 10 10"]
     """From u of a link to phi."""
     shift: Float[Array, " dof"]
@@ -73,27 +66,16 @@ class Problem(eqx.Module):
     centre: Float[Array, "dof 3"]
     """Origin of a link's h and Sigma: the middle of the box of its centre of mass [m]."""
     extra_unit: Float[Array, " extra"]
-    mass: Float[Array, "dof 2"]
-    com: Float[Array, "dof 3 2"]
-    inertia: Float[Array, "dof 6 2"]
-    total_mass: Float[Array, " 2"]
+    limits: Limits
     mass_box: Float[Array, "dof 2"]
     """Scaled, as G holds them; for the starts."""
     com_box: Float[Array, "dof 3 2"]
     total_box: Float[Array, " 2"]
     """[kg]"""
     extra_box: Float[Array, "extra 2"]
-    constraints: tuple[Constraint, ...] = eqx.field(static=True)
     dof: int = eqx.field(static=True)
     boxed: bool = eqx.field(static=True)
     """Whether any inertia is bounded by more than the triangle inequality."""
-
-
-class Multipliers(eqx.Module):
-    """Of the constraints that are not linear, or their margins or hinges."""
-
-    inertia: Float[Array, "dof 6 2 lanes"]
-    user: Float[Array, "user lanes"]
 
 
 class State(eqx.Module):
@@ -106,7 +88,8 @@ class State(eqx.Module):
     """The barrier's gradient at the start, negative."""
     pulled: Float[Array, " lanes"]
     """What it is weighed with at present: the path's mu, on the path."""
-    multipliers: Multipliers
+    multipliers: Float[Array, "dof 6 sides lanes"]
+    """Of the boxes on inertias; no sides where there are none."""
     weight: Float[Array, " lanes"]
     missed: Float[Array, " lanes"]
     """Largest violation of the constraints that are not linear, at the last update of their multipliers."""
@@ -142,67 +125,38 @@ def _inertia_entries(link: Float[Array, "dof 10 lanes"]) -> Float[Array, "dof 6 
     )
 
 
-def links_of(problem: Problem, u: Float[Array, " columns"]) -> Links:
-    """One lane's links in SI units."""
-    link = _of_links(problem, u[:, None])
+def _margins(problem: Problem, u: Float[Array, "columns lanes"]) -> Float[Array, "dof 6 sides lanes"]:
+    """Margins of the boxes on inertias [kg m²]."""
+    if not problem.boxed:
+        return jnp.zeros((problem.dof, 6, 0, u.shape[1]), u.dtype)
     size = problem.unit[:, 0] * problem.unit[:, 1] ** 2
-    six = _inertia_entries(link)[..., 0] * size[:, None]
-    h = jnp.stack([link[:, k, 0] for k in FIRST], 1)
-    m = link[:, MASS]
-    com = problem.centre + problem.unit[:, 1:] * h / m
-    return Links(problem.unit[:, 0] * m[:, 0], com, six[:, XYZ_MATRIX])
-
-
-def _margins(problem: Problem, u: Float[Array, "columns lanes"]) -> Multipliers:
-    """Margins of the constraints that are not linear, in their own units."""
-    lanes = u.shape[1]
-    inertia = jnp.zeros((problem.dof, 6, 0, lanes), u.dtype)
-    if problem.boxed:
-        size = problem.unit[:, 0] * problem.unit[:, 1] ** 2
-        six = _inertia_entries(_of_links(problem, u)) * size[:, None, None]
-        box = problem.inertia[..., None]
-        inertia = jnp.stack([six - box[:, :, 0], box[:, :, 1] - six], 2)
-    return Multipliers(inertia, jax.vmap(lambda u: _user_margins(problem, u), -1, -1)(u))
-
-
-def _user_margins(problem: Problem, u: Float[Array, " columns"]) -> Float[Array, " user"]:
-    if not problem.constraints:
-        return jnp.zeros(0, u.dtype)
-    links = links_of(problem, u)
-    return jnp.concatenate([jnp.ravel(constraint(links)) for constraint in problem.constraints])
-
-
-def _hinges(margins: Multipliers, multipliers: Multipliers, weight: Float[Array, " lanes"]) -> Multipliers:
-    """Pressure of each constraint: not negative, zero where it is amply satisfied."""
-    return jax.tree.map(lambda g, y: jnp.maximum(0.0, y + weight * (_MARGIN_INSET - g)), margins, multipliers)
-
-
-def _over_lanes(tree: Multipliers, of: Callable, initial: float) -> Float[Array, " lanes"]:
-    parts = [of(leaf.reshape(-1, leaf.shape[-1]), axis=0, initial=initial) for leaf in jax.tree.leaves(tree)]
-    return of(jnp.stack(parts), axis=0)
+    six = _inertia_entries(_of_links(problem, u)) * size[:, None, None]
+    box = problem.limits.inertia[..., None]
+    return jnp.stack([six - box[:, :, 0], box[:, :, 1] - six], 2)
 
 
 class _Value(NamedTuple):
     objective: Float[Array, " lanes"]
     """Sum of squares and augmented Lagrangian."""
     residual: Float[Array, "rows lanes"]
-    margins: Multipliers
-    hinges: Multipliers
+    margins: Float[Array, "dof 6 sides lanes"]
+    hinges: Float[Array, "dof 6 sides lanes"]
+    """Pressure of each box: not negative, zero where it is amply satisfied."""
 
 
 def _evaluate(problem: Problem, u: Float[Array, "columns lanes"], state: State) -> _Value:
     residual = problem.A @ u - problem.b[:, None]
     margins = _margins(problem, u)
-    hinges = _hinges(margins, state.multipliers, state.weight)
-    penalty = _over_lanes(jax.tree.map(jnp.square, hinges), jnp.sum, 0.0) / (2 * state.weight)
+    hinges = jnp.maximum(0.0, state.multipliers + state.weight * (_MARGIN_INSET - margins))
+    penalty = jnp.sum(hinges**2, (0, 1, 2)) / (2 * state.weight)
     return _Value(jnp.sum(residual**2, 0) + penalty, residual, margins, hinges)
 
 
 def _model(problem: Problem, state: State, value: _Value):
-    """Gradient of the objective; its Hessian beyond Q, as blocks of the links and as rows of the user's."""
+    """Gradient of the objective; its Hessian beyond Q, as blocks of the links."""
     n = 10 * problem.dof
     gradient = 2 * problem.A.T @ value.residual
-    blocks, rows = jnp.zeros(()), None
+    blocks = jnp.zeros(())
     link = _of_links(problem, state.u)
     if problem.boxed:
         size = (problem.unit[:, 0] * problem.unit[:, 1] ** 2)[:, None, None]
@@ -211,23 +165,17 @@ def _model(problem: Problem, state: State, value: _Value):
             jnp.moveaxis(jax.vmap(along)(jnp.eye(10, dtype=link.dtype)), 0, 2) * size[..., None]
         )  # (dof, 6, 10, lanes)
         E = jax.lax.optimization_barrier(E)
-        pressure = value.hinges.inertia[:, :, 1] - value.hinges.inertia[:, :, 0]
+        pressure = value.hinges[:, :, 1] - value.hinges[:, :, 0]
         gradient = gradient.at[:n].add(jnp.sum(E * pressure[:, :, None], 1).reshape(n, -1))
-        pressed = state.weight * jnp.sum(value.hinges.inertia > 0, 2)
+        pressed = state.weight * jnp.sum(value.hinges > 0, 2)
         blocks = jnp.sum(E[:, :, :, None] * (E * pressed[:, :, None])[:, :, None], 1)
-    if problem.constraints:
-        J = jax.vmap(jax.jacrev(lambda u: _user_margins(problem, u)), -1, -1)(
-            state.u
-        )  # (user, columns, lanes)
-        gradient = gradient - jnp.sum(J * value.hinges.user[:, None], 0)
-        rows = J * jnp.sqrt(state.weight * (value.hinges.user > 0))[:, None]
-    return gradient, blocks, rows
+    return gradient, blocks
 
 
-def _assemble(problem: Problem, blocks, ratio, rows, damping) -> Float[Array, "lanes columns columns"]:
+def _assemble(problem: Problem, blocks, ratio, damping) -> Float[Array, "lanes columns columns"]:
     """The step's matrix: lanes first, as the library's Cholesky wants them."""
     n, dof, first = 10 * problem.dof, problem.dof, PER_LINK * problem.dof
-    lanes, columns = ratio.shape[1], len(problem.free)
+    lanes, columns = ratio.shape[1], len(problem.Q)
     each = np.arange(dof)
     of_boxes = problem.G[:first, :n].reshape(dof, PER_LINK, dof, 10)[each, :, each]
     squares = of_boxes[:, :, :, None] * of_boxes[:, :, None]
@@ -245,11 +193,7 @@ def _assemble(problem: Problem, blocks, ratio, rows, damping) -> Float[Array, "l
         + ratio[first][:, None, None] * (low[:, None] * low)
         + ratio[first + 1][:, None, None] * (high[:, None] * high)
     )
-    if rows is not None:
-        H = H + jnp.einsum("kqb,krb->bqr", rows, rows)
-    mask = problem.free[:, None] * problem.free
-    diagonal = diagonal * problem.free + (1 - problem.free)
-    return H * mask + diagonal[:, :, None] * jnp.eye(columns)
+    return H + diagonal[:, :, None] * jnp.eye(columns)
 
 
 def initialise(
@@ -271,7 +215,7 @@ def initialise(
         z=1 / s,
         pull=pull,
         pulled=jnp.ones(lanes),
-        multipliers=jax.tree.map(jnp.zeros_like, margins),
+        multipliers=jnp.zeros_like(margins),
         weight=jnp.broadcast_to(_weight(problem), lanes),
         missed=jnp.full(lanes, jnp.inf),
         waited=fresh,
@@ -298,26 +242,26 @@ def step(problem: Problem, state: State, most: int) -> State:
     """One predictor-corrector step of every lane that is not done and has taken less than `most`."""
     active = ~state.done & (state.steps < most)
     n, order = 10 * problem.dof, _order(problem)
-    G, free = problem.G, problem.free[:, None]
+    G = problem.G
     S, s = matrices(problem, state.u), problem.G @ state.u + problem.d[:, None]
     S_inverse = small.inverse(S)
     gap = small.inner(S, state.Z) + jnp.sum(s * state.z, 0)
     mu = gap / order
     value = _evaluate(problem, state.u, state)
-    gradient, blocks, rows = _model(problem, state, value)
+    gradient, blocks = _model(problem, state, value)
     away = state.pull + _NEARNESS * (state.u - state.start)  # what the target's mu is multiplied with
     unbalanced = gradient - G.T @ state.z + state.pulled * away
     unbalanced = unbalanced.at[:n].add(-small.adjoint(state.Z).reshape(n, -1))
-    unbalanced = jnp.max(jnp.abs(unbalanced * free), 0)
-    pressed = _over_lanes(value.hinges, jnp.max, 0.0) > 0
+    unbalanced = jnp.max(jnp.abs(unbalanced), 0)
+    pressed = jnp.any(value.hinges > 0, (0, 1, 2))
     blocks = blocks + small.curvature(S_inverse, state.Z)
     # The next target is not known yet; a tenth of mu is about right.
     nearness = 0.1 * _NEARNESS * mu
-    H = _assemble(problem, blocks, state.z / s, rows, state.damping + nearness)
+    H = _assemble(problem, blocks, state.z / s, state.damping + nearness)
     factor = jax.lax.linalg.cholesky(H, symmetrize_input=False)
 
     def solve(rhs: Float[Array, "columns lanes"]) -> Float[Array, "columns lanes"]:
-        x = (rhs * free).T[..., None]
+        x = rhs.T[..., None]
         for transpose in (False, True):
             x = jax.lax.linalg.triangular_solve(factor, x, left_side=True, lower=True, transpose_a=transpose)
         return x[..., 0].T
@@ -351,11 +295,11 @@ def step(problem: Problem, state: State, most: int) -> State:
     du, _, dZ, _, dz, alpha, target, within_reach = jax.lax.fori_loop(0, 2, direction, nothing)
     alpha = jnp.where(alpha < 1, _TO_BOUNDARY * alpha, 1.0)
 
-    # Where a constraint bends, the whole step may lead astray: the longest of a few that does not.
+    # Where a box bends, the whole step may lead astray: the longest of a few that does not.
     def objective(share: float) -> Float[Array, " lanes"]:
         return _evaluate(problem, state.u + share * alpha * du, state).objective
 
-    if problem.boxed or problem.constraints:
+    if problem.boxed:
         fine = jnp.stack([objective(share) for share in _SHORTER]) <= value.objective + gap
         alpha = alpha * jnp.asarray(_SHORTER)[jnp.argmax(fine, 0)]
     u = state.u + alpha * du
@@ -368,16 +312,14 @@ def step(problem: Problem, state: State, most: int) -> State:
     u = pick(u, state.u)
     left = small.inner(matrices(problem, u), Z) + jnp.sum((G @ u + problem.d[:, None]) * z, 0)
 
-    # Constraints that are not linear: whether they hold, and whether their multipliers have settled.
-    missed = -jnp.minimum(0.0, _over_lanes(value.margins, jnp.min, jnp.inf))
-    slack = jax.tree.map(
-        lambda y, g: jnp.where(y > 0, y * jnp.abs(g - _MARGIN_INSET), 0.0), value.hinges, value.margins
-    )
-    unsettled = _over_lanes(slack, jnp.sum, 0.0)
+    # Boxes on inertias: whether they hold, and whether their multipliers have settled.
+    missed = -jnp.min(value.margins, (0, 1, 2), initial=0.0)
+    slack = value.hinges * jnp.abs(value.margins - _MARGIN_INSET)
+    unsettled = jnp.sum(slack, (0, 1, 2), where=value.hinges > 0)
     solved = state.tolerance * value.objective
     nothing_left = value.objective <= nothing_left
     # What is unbalanced shrinks with the step where the objective is quadratic; elsewhere it is looked at again.
-    pressed = pressed | (_over_lanes(value.hinges, jnp.max, 0.0) > 0)
+    pressed = pressed | jnp.any(value.hinges > 0, (0, 1, 2))
     unbalanced = unbalanced * jnp.where(pressed | ~better, 1.0, 1 - alpha)
     pulled = pick(state.pulled + alpha * (target - state.pulled), state.pulled)
     within_reach = jnp.abs(within_reach) * jnp.maximum(pulled / state.pulled, left / gap)
@@ -396,9 +338,7 @@ def step(problem: Problem, state: State, most: int) -> State:
         z=z,
         pull=state.pull,
         pulled=pulled,
-        multipliers=jax.tree.map(
-            lambda new, old: jnp.where(update, new, old), value.hinges, state.multipliers
-        ),
+        multipliers=jnp.where(update, value.hinges, state.multipliers),
         weight=jnp.where(update, heavier, state.weight),
         missed=jnp.where(update, missed, state.missed),
         waited=jnp.where(update, 0, state.waited + 1),

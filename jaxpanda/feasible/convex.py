@@ -1,0 +1,354 @@
+r"""Least squares under bounds alone: a problem that is convex, and starts that leave when they are done.
+
+**Coordinates.** A link's pseudo-inertia $J$ holds $m$, $mc$ and the second moment about a point, in which $\phi$
+is linear; $J \succ 0$ is positive mass, positive inertia and the triangle inequality at once, and boxes on $m$,
+$c$ ($m\,c_{lo} \le mc \le m\,c_{hi}$), the total mass and $\theta$ are linear. So there is no valley to crawl
+along, and each start's distance from the optimum is known. Only boxes on inertias about the centre of mass are
+not convex; they are wide, as a rule.
+
+**Work.** A step (`interior`) costs one Cholesky factor of all unknowns and four triangular solves a start; the
+links' 4x4 matrices are handled entry by entry, the starts contiguous (`small`). A start that is done leaves
+(`solve_chunk`).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxpanda_kernels import inertia
+from jaxtyping import Array, Float, Int, Key
+
+from ..errors import InputError
+from . import interior, small
+from .bounds import Bounds
+from .constraints import Constraint
+from .interior import FIRST, MASS, PER_LINK, Problem
+from .outcome import TRIANGLE_INSET, Outcome, extra_box, largest_violation, limits_of
+
+CHUNK = {"cpu": 512, "gpu": 32768}
+"""Starts handed to a device at once, by its platform."""
+TOLERANCE = 3e-3
+"""A start has converged where no more than this share of its objective is left to gain."""
+PRECISE = 16
+"""The first so many starts converge to `_PRECISION`: of what all of them find, the best is known well."""
+_PRECISION = 1e-5
+
+_BOX_INSET = 1e-9  # [kg], [m]: m c / m need not give c to the last bit
+_LEAST_MASS = 1e-3  # [kg]: a link without mass is no body, and MuJoCo refuses it
+_SEGMENT, _LEAST_LANES = 3, 128
+
+_ROW = np.array([0, 1, 1, 2, 2, 2])
+_COLUMN = np.array([0, 0, 1, 0, 1, 2])
+
+
+def scaled_problem(
+    A: Float[np.ndarray, "rows columns"],
+    b: Float[np.ndarray, " rows"],
+    bounds: Bounds,
+    extra_lower: Float[np.ndarray, " extra"] | None,
+    extra_upper: Float[np.ndarray, " extra"] | None,
+) -> Problem:
+    """Check the input and scale it; only where `suits`."""
+    dof = bounds.dof
+    low, high = extra_box(A, b, bounds, extra_lower, extra_upper)
+    mass, com = _inset(_masses(bounds)), _inset(bounds.com)
+    # Units of a link: its middling mass, and half its box for a radius of gyration.
+    radius = 0.5 * np.linalg.norm(bounds.com[..., 1] - bounds.com[..., 0], axis=-1) + 0.02
+    unit = np.stack([bounds.mass.mean(-1), radius], -1)
+    centre = bounds.com.mean(-1)
+    to_phi = _to_phi(unit, centre)
+    norms = np.linalg.norm(A[:, 10 * dof :], axis=0)
+    of_extra = np.where(norms > 0, np.linalg.norm(b) / np.where(norms > 0, norms, 1), 0)
+    of_extra = np.minimum(of_extra, np.where(high > low, high - low, np.inf))
+    of_extra = np.where(of_extra > 0, of_extra, 1.0)
+    scaled = np.concatenate(
+        [
+            np.einsum("rli,lij->rlj", A[:, : 10 * dof].reshape(-1, dof, 10), to_phi).reshape(len(A), -1),
+            A[:, 10 * dof :] * of_extra,
+        ],
+        1,
+    )
+    sigma = np.sqrt(np.mean(np.sum(scaled**2, 0))) or 1.0
+    G, d = _linear(
+        mass / unit[:, :1], (com - centre[..., None]) / unit[:, 1:, None], low / of_extra, high / of_extra
+    )
+    total = _total_mass(bounds, mass)
+    if total is not None:
+        for row, sign, bound in ((PER_LINK * dof, 1, total[0]), (PER_LINK * dof + 1, -1, -total[1])):
+            if np.isfinite(bound):
+                weight = unit[:, 0].sum()
+                G[row, MASS : 10 * dof : 10] = sign * unit[:, 0] / weight
+                d[row] = -bound / weight
+    A_scaled, b_scaled = jnp.asarray(scaled / sigma), jnp.asarray(b / sigma)
+    return Problem(
+        A=A_scaled,
+        b=b_scaled,
+        Q=2 * A_scaled.T @ A_scaled,
+        G=jnp.asarray(G),
+        d=jnp.asarray(d),
+        to_phi=jnp.asarray(to_phi),
+        shift=jnp.asarray(TRIANGLE_INSET / (unit[:, 0] * unit[:, 1] ** 2)),
+        unit=jnp.asarray(unit),
+        centre=jnp.asarray(centre),
+        extra_unit=jnp.asarray(of_extra),
+        extra_box=jnp.asarray(np.stack([low, high], -1) / of_extra[:, None]),
+        mass_box=jnp.asarray(mass / unit[:, :1]),
+        com_box=jnp.asarray((com - centre[..., None]) / unit[:, 1:, None]),
+        total_box=jnp.asarray(np.array([-np.inf, np.inf]) if total is None else total),
+        limits=limits_of(bounds, ()),
+        dof=dof,
+        boxed=bool(np.any(np.isfinite(_beyond_the_triangle(bounds.inertia)))),
+    )
+
+
+def suits(
+    bounds: Bounds,
+    constraints: tuple[Constraint, ...],
+    extra: Float[np.ndarray, "extra 2"],
+) -> bool:
+    """Whether there are no constraints beside the bounds and every box has an inside."""
+    mass = _masses(bounds)
+    boxes = [mass, bounds.com.reshape(-1, 2), extra]
+    if constraints or any(np.any(box[:, 1] - box[:, 0] <= 1e3 * _BOX_INSET) for box in boxes):
+        return False
+    return bounds.total_mass is None or _total_mass(bounds, _inset(mass)) is not None
+
+
+def _masses(bounds: Bounds) -> Float[np.ndarray, "dof 2"]:
+    return np.stack(
+        [np.minimum(np.maximum(bounds.mass[:, 0], _LEAST_MASS), bounds.mass[:, 1]), bounds.mass[:, 1]], -1
+    )
+
+
+def _inset(box: Float[np.ndarray, "*shape 2"]) -> Float[np.ndarray, "*shape 2"]:
+    return box + _BOX_INSET * np.array([1.0, -1.0])
+
+
+def _beyond_the_triangle(box: Float[np.ndarray, "dof 6 2"]) -> Float[np.ndarray, "dof 6 2"]:
+    r"""Bounds of xx, yy, zz, xy, xz, yz without those that a real body meets anyway.
+
+    $I_{xx} \ge 0$, and $\lvert I_{xy}\rvert \le \tfrac12 I_{zz}$.
+    """
+    box = box.copy()
+    diagonal, product = box[:, :3], box[:, 3:]
+    diagonal[..., 0] = np.where(diagonal[..., 0] <= 0, -np.inf, diagonal[..., 0])
+    most = 0.5 * diagonal[:, ::-1, 1]  # of zz, yy, xx
+    product[..., 0] = np.where(product[..., 0] <= -most, -np.inf, product[..., 0])
+    product[..., 1] = np.where(product[..., 1] >= most, np.inf, product[..., 1])
+    return box
+
+
+def _to_phi(
+    unit: Float[np.ndarray, "dof 2"], centre: Float[np.ndarray, "dof 3"]
+) -> Float[np.ndarray, "dof 10 10"]:
+    """From the ten entries of a link's scaled pseudo-inertia about `centre` to phi."""
+    found = np.zeros((len(unit), 10, 10))
+    for l, ((mass, length), c) in enumerate(zip(unit, centre, strict=True)):
+        X = np.eye(4)
+        X[:3, 3] = c
+        X = X @ np.diag([length, length, length, 1.0])
+        for q, (i, k) in enumerate(small.PAIRS):
+            E = np.zeros((4, 4))
+            E[i, k] = E[k, i] = 1.0
+            found[l, :, q] = mass * _phi(X @ E @ X.T)  # not its root twice: a fixed mass keeps its last bit
+    return found
+
+
+def _phi(J: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "10"]:
+    I = np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3]
+    return np.concatenate([J[3:, 3], J[:3, 3], I[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]])
+
+
+def _linear(
+    mass: Float[np.ndarray, "dof 2"],
+    com: Float[np.ndarray, "dof 3 2"],
+    low: Float[np.ndarray, " extra"],
+    high: Float[np.ndarray, " extra"],
+) -> tuple[Float[np.ndarray, "linear columns"], Float[np.ndarray, " linear"]]:
+    """`Problem.G` and `d` for scaled boxes, but for the total mass; an absent row is 0 u + 1 > 0."""
+    dof, extra = len(mass), len(low)
+    columns, first = 10 * dof + extra, PER_LINK * dof + 2
+    G, d = np.zeros((first + 2 * extra, columns)), np.ones(first + 2 * extra)
+
+    def add(row: int, column: int, sign: int, bound: float, of_mass: int | None = None) -> None:
+        """sign (u[column] - bound) > 0, or with the bound times a link's mass."""
+        if np.isfinite(bound):
+            G[row, column], d[row] = sign, 0.0
+            if of_mass is None:
+                d[row] = -sign * bound
+            else:
+                G[row, of_mass] = -sign * bound
+
+    for link in range(dof):
+        m, row = 10 * link + MASS, PER_LINK * link
+        add(row, m, 1, mass[link, 0])
+        add(row + 1, m, -1, mass[link, 1])
+        for k in range(3):
+            h = 10 * link + FIRST[k]
+            add(row + 2 + 2 * k, h, 1, com[link, k, 0], m)
+            add(row + 3 + 2 * k, h, -1, com[link, k, 1], m)
+    for k in range(extra):
+        add(first + k, 10 * dof + k, 1, low[k])
+        add(first + extra + k, 10 * dof + k, -1, high[k])
+    return G, d
+
+
+def _total_mass(bounds: Bounds, mass: Float[np.ndarray, "dof 2"]) -> Float[np.ndarray, " 2"] | None:
+    """The box of the total mass; an end is infinite where the links' own boxes imply it.
+
+    None where nothing lies inside.
+    """
+    if bounds.total_mass is None:
+        return None
+    least, most = mass.sum(0)
+    low, high = bounds.total_mass + np.array([_BOX_INSET, -_BOX_INSET])
+    if min(high, most) - max(low, least) < 1e-6 * most:
+        return None
+    return np.array([low if low > least else -np.inf, high if high < most else np.inf])
+
+
+def starting_points(
+    problem: Problem,
+    starts: int,
+    seed: int,
+    *,
+    first: int = 0,
+    initial: Float[np.ndarray, "given dof 10"] | None = None,
+) -> Float[Array, "starts columns"]:
+    """Starts number `first`, `first` + 1, ...: random bodies, the given ones in place of the first.
+
+    A start depends on its number and the seed alone.
+    """
+    drawn = jax.jit(jax.vmap(_start, in_axes=(None, 0)))
+    return drawn(origin_of(problem, seed, initial), first + jnp.arange(starts))
+
+
+class Origin(eqx.Module):
+    """Where starts come from."""
+
+    problem: Problem
+    given: Float[Array, "given columns"]
+    """Points to start from in place of random ones."""
+    seed: Int[Array, ""]
+
+
+def origin_of(problem: Problem, seed: int, initial: Float[np.ndarray, "given dof 10"] | None) -> Origin:
+    given = jnp.zeros((0, len(problem.Q)))
+    if initial is not None:
+        if initial.shape[1:] != (problem.dof, 10):
+            raise InputError(
+                f"initial parameters: expected shape (n, {problem.dof}, 10), got {initial.shape}"
+            )
+        given = jax.jit(jax.vmap(_given_start, in_axes=(None, 0)))(problem, jnp.asarray(initial))
+    return Origin(problem, given, jnp.asarray(seed))
+
+
+def _start(origin: Origin, number: Int[Array, ""]) -> Float[Array, " columns"]:
+    """A given point where there is one of this number, else a random one."""
+    given = origin.given
+    x0 = _random_start(origin.problem, jax.random.fold_in(jax.random.key(origin.seed), number))
+    return (
+        jnp.where(number < len(given), given[jnp.minimum(number, len(given) - 1)], x0) if len(given) else x0
+    )
+
+
+def solve_starts(origin: Origin, numbers: Int[Array, " chunk"], iterations: int) -> Outcome:
+    x0 = jax.vmap(lambda number: _start(origin, number))(numbers)
+    share = jnp.where(numbers < PRECISE, _PRECISION, TOLERANCE)
+    return solve_chunk(origin.problem, x0, iterations=iterations, tolerance=share)
+
+
+def _random_start(problem: Problem, key: Key[Array, ""]) -> Float[Array, " columns"]:
+    r"""Mass and centre of mass uniform in their boxes, the total mass in its own; Sigma Wishart, of the size that
+    suits the mass."""
+    dof = problem.dof
+    drawn = jax.random.uniform(
+        key, (10 * dof + 1,), minval=jnp.finfo(float).tiny
+    )  # one draw: quick to compile
+    between = lambda box, share: box[..., 0] + (box[..., 1] - box[..., 0]) * share
+    mass = between(problem.mass_box, drawn[:dof])
+    com = between(problem.com_box, drawn[dof : 4 * dof].reshape(dof, 3))
+    normal = jax.scipy.special.ndtri(drawn[4 * dof : 10 * dof]).reshape(dof, 6)
+    L = jnp.zeros((dof, 3, 3)).at[:, _ROW, _COLUMN].set(0.5 * normal)
+    Sigma = mass[:, None, None] * (L @ jnp.swapaxes(L, 1, 2))
+    return _interior(problem, mass, com, Sigma, 0.1, drawn[-1])
+
+
+def _given_start(problem: Problem, phi: Float[Array, "dof 10"]) -> Float[Array, " columns"]:
+    """The real body inside the boxes that is near to a given one."""
+    mass, com, I_com = jax.vmap(inertia.to_com)(phi)
+    values, vectors = jnp.linalg.eigh(jax.vmap(inertia.second_moment)(I_com))
+    Sigma = (vectors * jnp.maximum(values, 0.0)[:, None]) @ jnp.swapaxes(vectors, 1, 2)
+    unit, length = problem.unit[:, 0], problem.unit[:, 1:]
+    mass = jnp.clip(mass / unit, *problem.mass_box.T)
+    com = jnp.clip((com - problem.centre) / length, problem.com_box[..., 0], problem.com_box[..., 1])
+    return _interior(problem, mass, com, Sigma / (unit * problem.unit[:, 1] ** 2)[:, None, None], 0.005, None)
+
+
+def _interior(
+    problem: Problem,
+    mass: Float[Array, " dof"],
+    com: Float[Array, "dof 3"],
+    Sigma: Float[Array, "dof 3 3"],
+    share: float,
+    of_total: Float[Array, ""] | None,
+) -> Float[Array, " columns"]:
+    """Coordinates of scaled bodies, moved into the boxes by a share of the way to their middles.
+
+    `of_total`: where in its box to bring the total mass, 0 to 1; None only moves it inside.
+    """
+    towards = lambda x, box: x + share * (box.mean(-1) - x)
+    mass, com = towards(mass, problem.mass_box), towards(com, problem.com_box)
+    unit = problem.unit[:, 0]
+    least, most = problem.mass_box.T + share * (problem.mass_box.mean(-1) - problem.mass_box.T)
+    total, ends = mass @ unit, jnp.stack([least @ unit, most @ unit])
+    low, high = jnp.maximum(problem.total_box[0], ends[0]), jnp.minimum(problem.total_box[1], ends[1])
+    inside = jnp.stack([low, high]) + share * 0.5 * (high - low) * jnp.array([1.0, -1.0])
+    wanted = jnp.clip(total, *inside)
+    if of_total is not None:
+        bounded = jnp.isfinite(problem.total_box).any()
+        wanted = jnp.where(bounded, inside[0] + of_total * (inside[1] - inside[0]), wanted)
+    up = wanted > total
+    end = jnp.where(up, most, least)
+    way = (wanted - total) / jnp.where(end @ unit == total, 1.0, end @ unit - total)
+    mass = mass + way * (end - mass)
+    m = mass[:, None, None]
+    Sigma = Sigma + (2 * share * m + problem.shift[:, None, None]) * jnp.eye(3)
+    S = jnp.concatenate([Sigma + m * com[:, :, None] * com[:, None], m * com[:, :, None]], 2)
+    S = jnp.concatenate([S, jnp.concatenate([m * com[:, None], m], 2)], 1)
+    low, high = problem.extra_box.T
+    width = jnp.where(jnp.isfinite(high - low), high - low, 1.0)
+    extra = jnp.clip(0.0, low + 0.5 * share * width, high - 0.5 * share * width)
+    u = jnp.stack([S[:, i, k] for i, k in small.PAIRS], 1)
+    return jnp.concatenate([u.ravel(), extra])
+
+
+def solve_chunk(
+    problem: Problem,
+    x0: Float[Array, "starts columns"],
+    *,
+    iterations: int,
+    tolerance: float | Float[Array, " starts"] = TOLERANCE,
+    lanes: int | None = None,
+) -> Outcome:
+    """Minimise from every point of `x0`; a pure function to be compiled, no start knows of another.
+
+    `lanes` of them (a quarter when None) take a few steps at a time, those that have taken the fewest first:
+    what is done costs nothing more, and no start waits for the slowest.
+    """
+    lanes = max(_LEAST_LANES, len(x0) // 4) if lanes is None else lanes
+    lanes, n = min(lanes, len(x0)), 10 * problem.dof
+    left = lambda state: ~state.done & (state.steps < iterations)
+
+    def go_on(state: interior.State) -> interior.State:
+        chosen = jnp.argsort(jnp.where(left(state), state.steps, iterations + 1))[:lanes]
+        part = jax.tree.map(lambda leaf: leaf[..., chosen], state)
+        part = jax.lax.fori_loop(0, _SEGMENT, lambda _, part: interior.step(problem, part, iterations), part)
+        return jax.tree.map(lambda whole, new: whole.at[..., chosen].set(new), state, part)
+
+    state = interior.initialise(problem, x0.T, jnp.broadcast_to(jnp.asarray(tolerance, float), len(x0)))
+    state = jax.lax.while_loop(lambda state: jnp.any(left(state)), go_on, state)
+    phi = jnp.einsum("lpq,lqb->blp", problem.to_phi, state.u[:n].reshape(problem.dof, 10, -1))
+    violation = jax.vmap(lambda phi: largest_violation(problem.limits, phi))(phi)
+    extra = (state.u[n:] * problem.extra_unit[:, None]).T
+    return Outcome(phi, extra, violation, state.done & (violation == 0), state.accepted)

@@ -1,0 +1,88 @@
+"""What both solvers answer with, and by how much a start misses what was asked of it."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..errors import InputError
+from .bounds import Bounds
+from .constraints import Constraint, Links, triangle_inequality
+
+# The order xx, yy, zz, xy, xz, yz of tables.
+XYZ_ROW = np.array([0, 1, 2, 0, 0, 1])
+XYZ_COLUMN = np.array([0, 1, 2, 1, 2, 2])
+XYZ_MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+TRIANGLE_INSET = 1e-8
+"""How far from the triangle inequality's boundary to stay [kg m²]."""
+
+
+def extra_box(
+    A: Float[np.ndarray, "rows columns"],
+    b: Float[np.ndarray, " rows"],
+    bounds: Bounds,
+    lower: Float[np.ndarray, " extra"] | None,
+    upper: Float[np.ndarray, " extra"] | None,
+) -> tuple[Float[np.ndarray, " extra"], Float[np.ndarray, " extra"]]:
+    """Check the input; bounds of the unknowns beside the links, infinite where there are none."""
+    dof = bounds.dof
+    extra = A.shape[1] - 10 * dof
+    if extra < 0:
+        raise InputError(
+            f"A has {A.shape[1]} columns, fewer than the ten of each of {dof} links in the bounds"
+        )
+    if not (np.all(np.isfinite(A)) and np.all(np.isfinite(b))):
+        raise InputError("A or b holds a number that is not finite")
+    low = np.full(extra, -np.inf) if lower is None else np.asarray(lower, float)
+    high = np.full(extra, np.inf) if upper is None else np.asarray(upper, float)
+    if low.shape != (extra,) or high.shape != (extra,):
+        raise InputError(f"bounds of the extra unknowns: expected {extra}, got {low.size} and {high.size}")
+    return low, high
+
+
+class Limits(eqx.Module):
+    """What the links must meet, in SI units."""
+
+    mass: Float[Array, "dof 2"]
+    com: Float[Array, "dof 3 2"]
+    inertia: Float[Array, "dof 6 2"]
+    total_mass: Float[Array, " 2"]
+    constraints: tuple[Constraint, ...] = eqx.field(static=True)
+
+
+def limits_of(bounds: Bounds, constraints: tuple[Constraint, ...]) -> Limits:
+    return Limits(
+        mass=jnp.asarray(bounds.mass),
+        com=jnp.asarray(bounds.com),
+        inertia=jnp.asarray(bounds.inertia),
+        total_mass=jnp.asarray([-np.inf, np.inf] if bounds.total_mass is None else bounds.total_mass),
+        constraints=constraints,
+    )
+
+
+def largest_violation(limits: Limits, phi: Float[Array, "dof 10"]) -> Float[Array, ""]:
+    """The largest amount by which anything is missed; from `phi` alone, as any other program would see it."""
+    links = Links.from_phi(phi)
+    of_I = links.I_com[:, XYZ_ROW, XYZ_COLUMN]
+    total = jnp.sum(links.mass)
+    boxes = (
+        (links.mass, limits.mass),
+        (links.com, limits.com),
+        (of_I, limits.inertia),
+        (total, limits.total_mass),
+    )
+    margins = [margin for value, box in boxes for margin in (value - box[..., 0], box[..., 1] - value)]
+    margins += [constraint(links) for constraint in limits.constraints]
+    margins += [triangle_inequality(links)]
+    least = jnp.min(jnp.stack([jnp.min(margin, initial=jnp.inf) for margin in margins]))
+    return jnp.where(jnp.isfinite(phi).all(), jnp.maximum(0.0, -least), jnp.inf)
+
+
+class Outcome(eqx.Module):
+    """What the starts of a chunk came to."""
+
+    phi: Float[Array, "starts dof 10"]
+    extra: Float[Array, "starts extra"]
+    violation: Float[Array, " starts"]
+    converged: Bool[Array, " starts"]
+    iterations: Int[Array, " starts"]
