@@ -23,10 +23,21 @@ from . import interior, small
 from .bounds import Bounds
 from .constraints import Constraint
 from .interior import FIRST, MASS, PER_LINK, Problem
-from .outcome import TRIANGLE_INSET, Outcome, extra_box, largest_violation, limits_of
+from .outcome import (
+    TRIANGLE_INSET,
+    Outcome,
+    extra_box,
+    inertia_inset,
+    inertia_unit,
+    largest_violation,
+    limits_of,
+)
 
-CHUNK = {"cpu": 512, "gpu": 32768}
+CHUNK = {"cpu": 256, "gpu": 65536}
 """Starts handed to a device at once, by its platform."""
+LANES = {"cpu": 16, "gpu": 8192}
+"""How many of them take their steps together. A processor's cache holds 16 of the steps' matrices, not 128; and
+few lanes for many starts wait little for the slowest."""
 TOLERANCE = 3e-3
 """A start has converged where no more than this share of its objective is left to gain."""
 PRECISE = 16
@@ -35,7 +46,7 @@ _PRECISION = 1e-5
 
 _BOX_INSET = 1e-9  # [kg], [m]: m c / m need not give c to the last bit
 _LEAST_MASS = 1e-3  # [kg]: a link without mass is no body, and MuJoCo refuses it
-_SEGMENT, _LEAST_LANES = 3, 128
+_SEGMENT = 3  # steps between two choices of who goes on
 
 _ROW = np.array([0, 1, 1, 2, 2, 2])
 _COLUMN = np.array([0, 0, 1, 0, 1, 2])
@@ -52,9 +63,8 @@ def scaled_problem(
     dof = bounds.dof
     low, high = extra_box(A, b, bounds, extra_lower, extra_upper)
     mass, com = _inset(_masses(bounds)), _inset(bounds.com)
-    # Units of a link: its middling mass, and half its box for a radius of gyration.
-    radius = 0.5 * np.linalg.norm(bounds.com[..., 1] - bounds.com[..., 0], axis=-1) + 0.02
-    unit = np.stack([bounds.mass.mean(-1), radius], -1)
+    inertia_box = _beyond_the_triangle(bounds.inertia)
+    unit = _units(A, b, bounds, inertia_box)
     centre = bounds.com.mean(-1)
     to_phi = _to_phi(unit, centre)
     norms = np.linalg.norm(A[:, 10 * dof :], axis=0)
@@ -63,7 +73,7 @@ def scaled_problem(
     of_extra = np.where(of_extra > 0, of_extra, 1.0)
     scaled = np.concatenate(
         [
-            np.einsum("rli,lij->rlj", A[:, : 10 * dof].reshape(-1, dof, 10), to_phi).reshape(len(A), -1),
+            _of_entries(A, to_phi),
             A[:, 10 * dof :] * of_extra,
         ],
         1,
@@ -79,6 +89,8 @@ def scaled_problem(
                 weight = unit[:, 0].sum()
                 G[row, MASS : 10 * dof : 10] = sign * unit[:, 0] / weight
                 d[row] = -bound / weight
+    size = unit[:, 0] * unit[:, 1] ** 2
+    missed_in = inertia_unit(bounds, A / sigma)
     A_scaled, b_scaled = jnp.asarray(scaled / sigma), jnp.asarray(b / sigma)
     return Problem(
         A=A_scaled,
@@ -96,9 +108,42 @@ def scaled_problem(
         com_box=jnp.asarray((com - centre[..., None]) / unit[:, 1:, None]),
         total_box=jnp.asarray(np.array([-np.inf, np.inf]) if total is None else total),
         limits=limits_of(bounds, ()),
+        inertia_box=jnp.asarray(inertia_box / missed_in[:, None, None]),
+        inset=jnp.asarray(inertia_inset(bounds) / missed_in[:, None])[..., None, None],
+        inertia_unit=jnp.asarray(size / missed_in),
         dof=dof,
-        boxed=bool(np.any(np.isfinite(_beyond_the_triangle(bounds.inertia)))),
+        boxed=bool(np.any(np.isfinite(inertia_box))),
     )
+
+
+def _units(
+    A: Float[np.ndarray, "rows columns"],
+    b: Float[np.ndarray, " rows"],
+    bounds: Bounds,
+    inertia_box: Float[np.ndarray, "dof 6 2"],
+) -> Float[np.ndarray, "dof 2"]:
+    """Of mass [kg] and length [m], in which a link's pseudo-inertia is of order one.
+
+    The middling mass; for a radius of gyration half the box of the centre of mass, half of what the inertia may
+    be, or what least squares need, whichever is largest: the way to the optimum is long in small units.
+    """
+    middling = bounds.mass.mean(-1)
+    upper = inertia_box[:, :3, 1]
+    most = np.max(upper, -1, initial=0.0, where=np.isfinite(upper))
+    radius = 0.5 * np.linalg.norm(bounds.com[..., 1] - bounds.com[..., 0], axis=-1) + 0.02
+    unit = np.stack([middling, np.maximum(radius, 0.5 * np.sqrt(most / middling))], -1)
+    columns = np.concatenate([_of_entries(A, _to_phi(unit, bounds.com.mean(-1))), A[:, 10 * bounds.dof :]], 1)
+    entries = np.linalg.lstsq(columns, b, rcond=1e-6)[0][: 10 * bounds.dof].reshape(-1, 10)
+    needed = np.max(np.abs(np.delete(entries, [*FIRST, MASS], 1)), -1)
+    return unit * np.stack([np.ones_like(needed), np.sqrt(np.clip(needed, 1.0, 1e4))], -1)
+
+
+def _of_entries(
+    A: Float[np.ndarray, "rows columns"], to_phi: Float[np.ndarray, "dof 10 10"]
+) -> Float[np.ndarray, "rows links"]:
+    """The links' columns, for the entries of scaled pseudo-inertias in place of phi."""
+    dof = len(to_phi)
+    return np.einsum("rli,lij->rlj", A[:, : 10 * dof].reshape(-1, dof, 10), to_phi).reshape(len(A), -1)
 
 
 def suits(
@@ -252,10 +297,10 @@ def _start(origin: Origin, number: Int[Array, ""]) -> Float[Array, " columns"]:
     )
 
 
-def solve_starts(origin: Origin, numbers: Int[Array, " chunk"], iterations: int) -> Outcome:
+def solve_starts(origin: Origin, numbers: Int[Array, " chunk"], iterations: int, lanes: int) -> Outcome:
     x0 = jax.vmap(lambda number: _start(origin, number))(numbers)
     share = jnp.where(numbers < PRECISE, _PRECISION, TOLERANCE)
-    return solve_chunk(origin.problem, x0, iterations=iterations, tolerance=share)
+    return solve_chunk(origin.problem, x0, iterations=iterations, tolerance=share, lanes=lanes)
 
 
 def _random_start(problem: Problem, key: Key[Array, ""]) -> Float[Array, " columns"]:
@@ -329,14 +374,13 @@ def solve_chunk(
     *,
     iterations: int,
     tolerance: float | Float[Array, " starts"] = TOLERANCE,
-    lanes: int | None = None,
+    lanes: int = LANES["cpu"],
 ) -> Outcome:
     """Minimise from every point of `x0`; a pure function to be compiled, no start knows of another.
 
-    `lanes` of them (a quarter when None) take a few steps at a time, those that have taken the fewest first:
-    what is done costs nothing more, and no start waits for the slowest.
+    `lanes` of them take a few steps at a time, those that have taken the fewest first: what is done costs nothing
+    more, and no start waits for the slowest.
     """
-    lanes = max(_LEAST_LANES, len(x0) // 4) if lanes is None else lanes
     lanes, n = min(lanes, len(x0)), 10 * problem.dof
     left = lambda state: ~state.done & (state.steps < iterations)
 

@@ -37,10 +37,10 @@ FIRST = [small.PAIRS.index((k, 3)) for k in range(3)]
 PER_LINK = 8
 """Linear constraints of a link: its mass and its centre of mass, from below and above."""
 
-_MARGIN_INSET = 1e-6  # in the constraint's own unit
 _TO_BOUNDARY = 0.95
-_LEAST_DAMPING = 1e-12
+_LEAST_DAMPING, _SLIGHT_DAMPING = 1e-12, 1e-3
 _NEARNESS = 300.0  # kappa: how much an end resembles its start, where the optimum leaves that open
+_WEIGHT = 3.0  # of the boxes on inertias, at first; in their units
 _MOST_WEIGHT = 1e6  # as a multiple of the first
 _SHORTER = (1.0, 0.5, 0.2, 0.05)
 _PATIENCE = 4  # steps between two updates of the multipliers
@@ -67,6 +67,12 @@ class Problem(eqx.Module):
     """Origin of a link's h and Sigma: the middle of the box of its centre of mass [m]."""
     extra_unit: Float[Array, " extra"]
     limits: Limits
+    inertia_box: Float[Array, "dof 6 2"]
+    """In a unit of its own for each link (`outcome.inertia_unit`)."""
+    inset: Float[Array, "dof 6 1 1"]
+    """How far inside it to aim."""
+    inertia_unit: Float[Array, " dof"]
+    """From the unit of S to that unit."""
     mass_box: Float[Array, "dof 2"]
     """Scaled, as G holds them; for the starts."""
     com_box: Float[Array, "dof 3 2"]
@@ -126,12 +132,11 @@ def _inertia_entries(link: Float[Array, "dof 10 lanes"]) -> Float[Array, "dof 6 
 
 
 def _margins(problem: Problem, u: Float[Array, "columns lanes"]) -> Float[Array, "dof 6 sides lanes"]:
-    """Margins of the boxes on inertias [kg m²]."""
+    """Margins of the boxes on inertias, in `Problem.inertia_unit`'s unit."""
     if not problem.boxed:
         return jnp.zeros((problem.dof, 6, 0, u.shape[1]), u.dtype)
-    size = problem.unit[:, 0] * problem.unit[:, 1] ** 2
-    six = _inertia_entries(_of_links(problem, u)) * size[:, None, None]
-    box = problem.limits.inertia[..., None]
+    six = _inertia_entries(_of_links(problem, u)) * problem.inertia_unit[:, None, None]
+    box = problem.inertia_box[..., None]
     return jnp.stack([six - box[:, :, 0], box[:, :, 1] - six], 2)
 
 
@@ -147,7 +152,7 @@ class _Value(NamedTuple):
 def _evaluate(problem: Problem, u: Float[Array, "columns lanes"], state: State) -> _Value:
     residual = problem.A @ u - problem.b[:, None]
     margins = _margins(problem, u)
-    hinges = jnp.maximum(0.0, state.multipliers + state.weight * (_MARGIN_INSET - margins))
+    hinges = jnp.maximum(0.0, state.multipliers + state.weight * (problem.inset - margins))
     penalty = jnp.sum(hinges**2, (0, 1, 2)) / (2 * state.weight)
     return _Value(jnp.sum(residual**2, 0) + penalty, residual, margins, hinges)
 
@@ -159,10 +164,10 @@ def _model(problem: Problem, state: State, value: _Value):
     blocks = jnp.zeros(())
     link = _of_links(problem, state.u)
     if problem.boxed:
-        size = (problem.unit[:, 0] * problem.unit[:, 1] ** 2)[:, None, None]
         along = lambda e: jax.jvp(_inertia_entries, (link,), (jnp.broadcast_to(e[:, None], link.shape),))[1]
         E = (
-            jnp.moveaxis(jax.vmap(along)(jnp.eye(10, dtype=link.dtype)), 0, 2) * size[..., None]
+            jnp.moveaxis(jax.vmap(along)(jnp.eye(10, dtype=link.dtype)), 0, 2)
+            * problem.inertia_unit[:, None, None, None]
         )  # (dof, 6, 10, lanes)
         E = jax.lax.optimization_barrier(E)
         pressure = value.hinges[:, :, 1] - value.hinges[:, :, 0]
@@ -216,7 +221,7 @@ def initialise(
         pull=pull,
         pulled=jnp.ones(lanes),
         multipliers=jnp.zeros_like(margins),
-        weight=jnp.broadcast_to(_weight(problem), lanes),
+        weight=jnp.full(lanes, _WEIGHT),
         missed=jnp.full(lanes, jnp.inf),
         waited=fresh,
         damping=jnp.full(lanes, _LEAST_DAMPING),
@@ -226,11 +231,6 @@ def initialise(
     )
     mu = _evaluate(problem, u, state).objective / _order(problem)
     return eqx.tree_at(lambda s: (s.Z, s.z, s.pulled), state, (mu * state.Z, mu * state.z, mu))
-
-
-def _weight(problem: Problem) -> Float[Array, ""]:
-    """First weight of the constraints that are not linear: in proportion to an objective that is large."""
-    return jnp.maximum(1.0, jnp.sum(problem.b**2))
 
 
 def _order(problem: Problem) -> int:
@@ -252,7 +252,6 @@ def step(problem: Problem, state: State, most: int) -> State:
     away = state.pull + _NEARNESS * (state.u - state.start)  # what the target's mu is multiplied with
     unbalanced = gradient - G.T @ state.z + state.pulled * away
     unbalanced = unbalanced.at[:n].add(-small.adjoint(state.Z).reshape(n, -1))
-    unbalanced = jnp.max(jnp.abs(unbalanced), 0)
     pressed = jnp.any(value.hinges > 0, (0, 1, 2))
     blocks = blocks + small.curvature(S_inverse, state.Z)
     # The next target is not known yet; a tenth of mu is about right.
@@ -314,22 +313,26 @@ def step(problem: Problem, state: State, most: int) -> State:
 
     # Boxes on inertias: whether they hold, and whether their multipliers have settled.
     missed = -jnp.min(value.margins, (0, 1, 2), initial=0.0)
-    slack = value.hinges * jnp.abs(value.margins - _MARGIN_INSET)
+    slack = value.hinges * jnp.abs(value.margins - problem.inset)
     unsettled = jnp.sum(slack, (0, 1, 2), where=value.hinges > 0)
     solved = state.tolerance * value.objective
     nothing_left = value.objective <= nothing_left
-    # What is unbalanced shrinks with the step where the objective is quadratic; elsewhere it is looked at again.
+    # What is unbalanced after the step, where the objective is quadratic; elsewhere it is looked at again.
     pressed = pressed | jnp.any(value.hinges > 0, (0, 1, 2))
-    unbalanced = unbalanced * jnp.where(pressed | ~better, 1.0, 1 - alpha)
+    taken = jnp.where(pressed | ~better, 0.0, alpha)
+    unbalanced = (1 - taken) * unbalanced + taken * (_NEARNESS * target - nearness - state.damping) * du
+    unbalanced = jnp.max(jnp.abs(unbalanced), 0)
     pulled = pick(state.pulled + alpha * (target - state.pulled), state.pulled)
     within_reach = jnp.abs(within_reach) * jnp.maximum(pulled / state.pulled, left / gap)
-    close = (within_reach <= solved) & (left <= jnp.minimum(0.5 * value.objective, 300 * solved))
+    close = (within_reach <= solved) & (left <= jnp.minimum(0.5 * value.objective, 3 * solved))
+    # What the start still pulls, and damping, hide how far the optimum is.
+    close = close & (pulled * jnp.max(jnp.abs(away), 0) <= 3 * solved) & (state.damping <= _SLIGHT_DAMPING)
     on_path = (close & (unbalanced <= 0.01 * jnp.sqrt(solved))) | nothing_left
     done = state.done | (active & on_path & (missed <= 0) & ((unsettled <= solved) | nothing_left))
     update = active & ((state.waited >= _PATIENCE) | on_path)
     stuck = missed > 0.25 * state.missed
-    factor = jnp.where(stuck, 10.0, jnp.where(state.weight < 100 * _weight(problem), 3.0, 1.0))
-    heavier = jnp.minimum(factor * state.weight, _MOST_WEIGHT * _weight(problem))
+    factor = jnp.where(stuck, 10.0, jnp.where(state.weight < 100 * _WEIGHT, 3.0, 1.0))
+    heavier = jnp.minimum(factor * state.weight, _MOST_WEIGHT * _WEIGHT)
     return State(
         u=u,
         start=state.start,
@@ -344,7 +347,7 @@ def step(problem: Problem, state: State, most: int) -> State:
         waited=jnp.where(update, 0, state.waited + 1),
         damping=jnp.where(
             better,
-            jnp.maximum(0.2 * state.damping, _LEAST_DAMPING),
+            jnp.maximum(0.1 * state.damping, _LEAST_DAMPING),
             jnp.clip(10 * state.damping, 1e-4, 1e12),
         ),
         accepted=state.accepted + move,

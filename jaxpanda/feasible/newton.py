@@ -40,6 +40,8 @@ from .outcome import (
     Limits,
     Outcome,
     extra_box,
+    inertia_inset,
+    inertia_unit,
     largest_violation,
     limits_of,
 )
@@ -74,6 +76,10 @@ class Problem(eqx.Module):
     scale: Float[Array, " columns"]
     """A typical size of each unknown."""
     limits: Limits
+    inertia_box: Float[Array, "dof 6 2"]
+    """A little inside the limits [kg m²]."""
+    inertia_unit: Float[Array, " dof"]
+    """In which it is missed [kg m²]."""
     dof: int = eqx.field(static=True)
 
 
@@ -114,11 +120,15 @@ def scaled_problem(
         upper=jnp.asarray(np.concatenate([upper.ravel(), high])),
         scale=jnp.asarray(np.concatenate([scale.ravel(), of_extra])),
         limits=limits_of(bounds, constraints),
+        inertia_box=jnp.asarray(_inset(bounds.inertia, inertia_inset(bounds))),
+        inertia_unit=jnp.asarray(inertia_unit(bounds, A / sigma)),
         dof=dof,
     )
 
 
-def _inset(box: Float[np.ndarray, "*shape 2"], by: float) -> Float[np.ndarray, "*shape 2"]:
+def _inset(
+    box: Float[np.ndarray, "*shape 2"], by: float | Float[np.ndarray, "*shape"]
+) -> Float[np.ndarray, "*shape 2"]:
     """The box moved inwards, at most by a quarter of its width."""
     inset = np.minimum(by, (box[..., 1] - box[..., 0]) / 4)
     return np.stack([box[..., 0] + inset, box[..., 1] - inset], -1)
@@ -282,9 +292,9 @@ def _user_margins(problem: Problem, links: Links) -> Float[Array, " user"]:
 
 
 def _margins(problem: Problem, links: Links, of_I: Float[Array, "dof 6"]) -> _Margins:
-    total = jnp.sum(links.mass)
+    total, box = jnp.sum(links.mass), problem.inertia_box
     return _Margins(
-        inertia=jnp.stack([of_I - problem.limits.inertia[..., 0], problem.limits.inertia[..., 1] - of_I], -1),
+        inertia=jnp.stack([of_I - box[..., 0], box[..., 1] - of_I], -1) / problem.inertia_unit[:, None, None],
         total=jnp.stack([total - problem.limits.total_mass[0], problem.limits.total_mass[1] - total]),
         user=_user_margins(problem, links),
     )
@@ -335,14 +345,15 @@ def _quadratic_model(
     # Gradients with respect to the quantities that x determines: phi, then I_com and the mass directly.
     of_A = 2 * problem.A.T @ state.residual
     of_phi = of_A[:n].reshape(-1, 10)
-    pressure = hinges.inertia[..., 1] - hinges.inertia[..., 0]
+    unit = problem.inertia_unit[:, None]
+    pressure = (hinges.inertia[..., 1] - hinges.inertia[..., 0]) / unit
     gradient = jnp.einsum("lja,lj->la", D, of_phi) + jnp.einsum("lja,lj->la", E, pressure)
     gradient = gradient.at[:, 0].add(hinges.total[1] - hinges.total[0])
     of_inertia = jax.vmap(_of_inertia)(of_phi[:, 4:]) + jax.vmap(_symmetric)(pressure)
     # Gauss-Newton part of the data and of the boxes.
     QD = jnp.einsum("nlj,ljb->nlb", problem.Q[:, :n].reshape(-1, dof, 10), D)
     H_links = jnp.einsum("lja,ljmb->lamb", D, QD[:n].reshape(dof, 10, dof, 10))
-    pressed = weight * jnp.sum(hinges.inertia > 0, -1)
+    pressed = weight * jnp.sum(hinges.inertia > 0, -1) / unit**2
     H_links = H_links.at[each, :, each].add(jnp.einsum("lja,lj,ljb->lab", E, pressed, E))
     H_links = H_links.at[:, 0, :, 0].add(weight * jnp.sum(hinges.total > 0))
     if problem.limits.constraints:

@@ -40,6 +40,28 @@ def extra_box(
     return low, high
 
 
+def inertia_inset(bounds: Bounds) -> Float[np.ndarray, "dof 6"]:
+    """How far inside boxes on inertias to aim [kg m²]: a millionth of a link's largest bound, and inside."""
+    width = bounds.inertia[..., 1] - bounds.inertia[..., 0]
+    return np.minimum(1e-6 * _largest_inertia(bounds)[:, None], width / 4)
+
+
+def inertia_unit(bounds: Bounds, A: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, " dof"]:
+    r"""In what to measure by how much boxes on inertias are missed [kg m²].
+
+    A link's largest bound, or what changes $\lVert A\phi\rVert^2$ by about one where that is less: boxes
+    would give way to a steeper objective.
+    """
+    steepest = np.sum(A**2, 0)[: 10 * bounds.dof].reshape(-1, 10)[:, 4:].max(-1)
+    return np.minimum(_largest_inertia(bounds), (2 * np.maximum(steepest, 1e-300)) ** -0.5)
+
+
+def _largest_inertia(bounds: Bounds) -> Float[np.ndarray, " dof"]:
+    """Of a link's bounds [kg m²]; one where it has none."""
+    found = np.max(np.where(np.isfinite(bounds.inertia), np.abs(bounds.inertia), 0.0), (1, 2))
+    return np.where(found > 0, found, 1.0)
+
+
 class Limits(eqx.Module):
     """What the links must meet, in SI units."""
 

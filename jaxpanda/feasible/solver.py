@@ -2,9 +2,9 @@ r"""Many-start least squares over physically feasible links.
 
 $$\min_{x}\ \lVert A\,(\phi, \theta) - b\rVert^2 \quad\text{over links that could be built}$$
 
-Under bounds alone the problem is convex in the right coordinates, and every start is carried to the optimum by an
-interior-point method of its own (`convex`). Under further constraints, which need not be convex, or where a box is
-a point, Newton steps are taken under an augmented Lagrangian (`newton`).
+Under bounds alone the problem is convex in the right coordinates, but for boxes on inertias: an interior-point
+method carries every start to the optimum (`convex`). Under further constraints, which need not be convex, or
+where a box is a point, Newton steps are taken under an augmented Lagrangian (`newton`).
 """
 
 import dataclasses
@@ -40,8 +40,8 @@ class Solutions:
     violation: Float[np.ndarray, " starts"]
     """Largest amount by which a bound or constraint is missed, recomputed from `phi`; 0 where none is."""
     converged: Bool[np.ndarray, " starts"]
-    """Feasible, and near the optimum: by the estimate of the step that aims at it (`convex.TOLERANCE`), or because
-    the last round's second half gained less than 0.1 % (`newton`)."""
+    """Feasible, and near the optimum: by the estimate of the step that aims at it (`convex.TOLERANCE`), or as the
+    last round's second half gained less than 0.1 % (`newton`)."""
     iterations: Int[np.ndarray, " starts"]
     """Steps that lowered the objective."""
     compile_seconds: float
@@ -85,7 +85,7 @@ def solve(
         initial: parameters to start from in place of as many random starts; moved into the boxes.
         starts: number of starts.
         seed: same seed, same answer, whatever the chunk.
-        chunk: how many starts are solved at once on each device, which bounds the memory; what suits the solver and the
+        chunk: how many starts a device is given at once, which bounds the memory; what suits the solver and the
             platform when None.
         rounds: how often `newton` updates the constraints' multipliers.
         iterations: Newton steps a round; `convex` takes at most `rounds` times as many, and fewer as a rule.
@@ -107,8 +107,9 @@ def solve(
     if convex.suits(bounds, constraints, extra):
         problem = convex.scaled_problem(A, b, bounds, extra_lower, extra_upper)
         origin = convex.origin_of(problem, seed, initial)
-        solve_starts, steps = convex.solve_starts, (rounds * iterations,)
-        usual = convex.CHUNK.get(device.platform, convex.CHUNK["gpu"])
+        kind = "cpu" if device.platform == "cpu" else "gpu"
+        solve_starts, steps = convex.solve_starts, (rounds * iterations, convex.LANES[kind])
+        usual = convex.CHUNK[kind]
     else:
         problem = newton.scaled_problem(A, b, bounds, constraints, extra_lower, extra_upper)
         origin = newton.origin_of(problem, bounds, seed, initial)
