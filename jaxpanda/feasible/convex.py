@@ -38,7 +38,7 @@ CHUNK = {"cpu": 256, "gpu": 65536}
 LANES = {"cpu": 16, "gpu": 8192}
 """How many of them take their steps together. A processor's cache holds 16 of the steps' matrices, not 128; and
 few lanes for many starts wait little for the slowest."""
-TOLERANCE = 3e-3
+TOLERANCE = 1e-2
 """A start has converged where no more than this share of its objective is left to gain."""
 PRECISE = 16
 """The first so many starts converge to `_PRECISION`: of what all of them find, the best is known well."""
@@ -47,6 +47,7 @@ _PRECISION = 1e-5
 _BOX_INSET = 1e-9  # [kg], [m]: m c / m need not give c to the last bit
 _LEAST_MASS = 1e-3  # [kg]: a link without mass is no body, and MuJoCo refuses it
 _SEGMENT = 3  # steps between two choices of who goes on
+_INWARDS = 0.02  # how far random starts keep from their boxes, as a share of the way to the middle
 
 _ROW = np.array([0, 1, 1, 2, 2, 2])
 _COLUMN = np.array([0, 0, 1, 0, 1, 2])
@@ -316,7 +317,7 @@ def _random_start(problem: Problem, key: Key[Array, ""]) -> Float[Array, " colum
     normal = jax.scipy.special.ndtri(drawn[4 * dof : 10 * dof]).reshape(dof, 6)
     L = jnp.zeros((dof, 3, 3)).at[:, _ROW, _COLUMN].set(0.5 * normal)
     Sigma = mass[:, None, None] * (L @ jnp.swapaxes(L, 1, 2))
-    return _interior(problem, mass, com, Sigma, 0.1, drawn[-1])
+    return _interior(problem, mass, com, Sigma, _INWARDS, drawn[-1])
 
 
 def _given_start(problem: Problem, phi: Float[Array, "dof 10"]) -> Float[Array, " columns"]:

@@ -39,7 +39,7 @@ PER_LINK = 8
 
 _TO_BOUNDARY = 0.95
 _LEAST_DAMPING, _SLIGHT_DAMPING = 1e-12, 1e-3
-_NEARNESS = 300.0  # kappa: how much an end resembles its start, where the optimum leaves that open
+_NEARNESS = 150.0  # kappa: how much an end resembles its start, where the optimum leaves that open
 _WEIGHT = 3.0  # of the boxes on inertias, at first; in their units
 _MOST_WEIGHT = 1e6  # as a multiple of the first
 _SHORTER = (1.0, 0.5, 0.2, 0.05)
