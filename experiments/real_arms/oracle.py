@@ -82,7 +82,7 @@ def _relative(problem: Problem, terms, fitted, cutoff: float) -> float:
 
 
 def _squares(problem: Problem, terms, x, tests, cutoff: float) -> tuple[float, float]:
-    error, size = 0.0, 0.0
+    error, size, x = 0.0, 0.0, problem.explained(x)
     for r, (trace, test) in enumerate(zip(problem.traces, tests, strict=True)):
         columns = np.concatenate([problem.nuisance[r], *(t.columns[r] for t in terms)], 2)
         assert trace.tau is not None

@@ -7,7 +7,8 @@ Two premises come from the user: how well the model's numbers are known, and rec
   explaining half of something that both show.
 - Numbers may be known worse than the user says: a model that was identified without friction, or on another
   arm, is off by far more than the noise of an identification. If the recordings are likelier by `CONTRADICTION`
-  under a wider word of `knowledge`, beside all effects found, the search is repeated with that word.
+  under a wider word of `knowledge`, beside all effects found, the search is repeated with that word. So it is if
+  that word alone does better than the inertial parameters of several links that were found to be wrong.
 """
 
 import dataclasses
@@ -16,6 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..effects.load import InertialParameters, Payload
 from . import knowledge as knowledge_
 from .problem import Problem, Term, posed
 from .search import State, search
@@ -24,6 +26,8 @@ from .traces import Trace
 CONTRADICTION, SHARE = 100.0, 0.03
 """Evidence by which recordings contradict what is said to be known: nats, and as a share of what the effects
 explain, whose shapes are never quite right and leave something for any freedom to take."""
+
+_SEVERAL = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,4 +92,11 @@ def _contradicted(premises: Premises, state: State) -> knowledge_.Knowledge | No
     explained = state.design.log_evidence - problem.design((), state.noise).log_evidence
     other = pose(problem.traces, problem.active, word, premises.background).problem
     gained = other.design(state.terms, state.noise).log_evidence - state.design.log_evidence
-    return word if gained > max(CONTRADICTION, SHARE * explained) else None
+    if gained > max(CONTRADICTION, SHARE * explained):
+        return word
+    # Several bodies that are not what the model says are one model whose numbers are not known.
+    bodies = [t for t in state.terms if isinstance(t.effect, InertialParameters | Payload)]
+    if len({t.key for t in bodies}) < _SEVERAL:
+        return None
+    others = tuple(t for t in state.terms if all(t is not b for b in bodies))
+    return word if other.design(others, state.noise).log_evidence > state.design.log_evidence else None

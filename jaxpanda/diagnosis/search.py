@@ -52,13 +52,18 @@ _RICHER = ("asymmetric_friction", "stribeck_friction", "load_dependent_friction"
 RICHER_SHARE = 0.001
 """Share of the evidence that laws which hold Coulomb's as a special case must win by: the real one is neither."""
 MOST_SWAPPED = 6
-MOST_TERMS, MOST_NAMES = 10, 5
+MOST_TERMS, MOST_NAMES, MOST_ADDED = 10, 5, 8
 _REFINED = 7
 _ROUNDS = 4
 _TRIED = 8
 _SETTLED = 4
 _OVERLAP, _FELT = 0.05, 0.02
 _CLOSE = 0.5
+CROWDED, BEGUN = 6, 50.0
+"""Terms from which another beginning is tried, and the evidence it must win by [nats]."""
+_SIMPLE = ("viscous_friction", "coulomb_friction", "presliding_hysteresis", "torque_offset")
+_BEGINNINGS = 2
+"""Simpler effects from which a joint is built up again."""
 _GIVEN = 0.2
 _BEYOND = 1e9  # [s]: no recording is as long
 _PAID = 8.0  # [nats]: for the search of when a body changes hands
@@ -87,23 +92,80 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
 
 
 def search(problem: Problem, log: list[str] | None = None) -> State:
-    """Add the likeliest effect while one has evidence; then see if another does better in its place."""
+    """Add the likeliest effect while one has evidence; then see if another does better in its place.
+
+    Where many are needed, the arm may be one whose every joint rubs, sticks and has an offset, as real ones do: a
+    search that begins with that is made as well, and taken if the recordings are likelier by it.
+    """
     say = log.append if log is not None else (lambda _: None)
-    state, proposals, joints = start(problem), [], None
-    while len(state.terms) < MOST_TERMS and len({t.effect.name for t in state.terms}) < MOST_NAMES:
+    state = finish(problem, grow(problem, start(problem), say), say)
+    if len(state.terms) < CROWDED:
+        return state
+    say("another beginning: friction and offset at all joints")
+    other = with_terms(problem, everywhere(problem, state.noise))
+    other = finish(problem, grow(problem, other, say, lasting=True), say)
+    quiet = State(state.terms, other.noise, problem.design(state.terms, other.noise))
+    gained = other.design.log_evidence - quiet.design.log_evidence
+    say(f"which brings {gained:.0f} over the other")
+    return other if gained > BEGUN else state
+
+
+def finish(problem: Problem, state: State, say: Any) -> State:
+    """Drop, exchange and test terms until the rest stands."""
+    state = swap(problem, handed_over(problem, prune(problem, state, say), say), say)
+    state = handed_over(problem, prune(problem, state, say), say)
+    return gate(problem, contest(problem, state, say), say)
+
+
+def everywhere(problem: Problem, noise: Noise) -> list[Term]:
+    """For each joint what simple effects explain of it together."""
+    base = State((), noise, problem.design((), noise))
+    found = [max(_chains(problem, base, joint), key=len, default=()) for joint in range(problem.dof)]
+    return [term for chain in found for term in chain]
+
+
+def grow(problem: Problem, state: State, say: Any, *, lasting: bool = False) -> State:
+    """Add the likeliest effect while one has evidence; only what does not happen once, if `lasting`."""
+    proposals, joints = [], None
+    most = max(MOST_TERMS, len(state.terms) + MOST_ADDED)
+    most_names = MOST_NAMES + len({t.effect.name for t in state.terms})
+    while len(state.terms) < most:
         proposals = ranked(problem, state.design, state.noise, joints, proposals)
         say(f"{len(state.terms)} terms: " + describe(proposals[:6]))
-        held = {t.key for t in state.terms}
+        held, names = {t.key for t in state.terms}, {t.effect.name for t in state.terms}
         new = [p for p in proposals if p.key not in held or p.effect.repeats]
+        new = [p for p in new if p.key[0] in names or len(names) < most_names]
+        new = [p for p in new if not (lasting and p.effect.bound_to_recording)]
         worthy = next((p for p in new[:_TRIED] if is_worthy(problem, state, p, say)), None)
         if worthy is None:
             break
         state = with_terms(problem, (*state.terms, problem.term(worthy.effect, worthy.deviation)))
         state = handed_over(problem, settle(problem, state), say)
         joints = set(np.flatnonzero(shares(state)[-1] > _FELT).tolist())
-    state = swap(problem, handed_over(problem, prune(problem, state, say), say), say)
-    state = handed_over(problem, prune(problem, state, say), say)
-    return gate(problem, contest(problem, state, say), say)
+    return state
+
+
+def _chains(problem: Problem, base: State, joint: int) -> list[tuple[Term, ...]]:
+    """Sets of simple effects of a joint, each grown greedily from another beginning."""
+    groups = [g for g in problem.library if g.joint == joint and g.name in _SIMPLE]
+
+    def likeliest(state: State, count: int) -> list[Proposal]:
+        held = {t.effect.name for t in state.terms if t.effect.joints == (joint,)}
+        tried = grids(problem, state.design, state.noise, [g for g in groups if g.name not in held])
+        tried = sorted(tried, key=lambda p: -p.evidence)[:count]
+        tried = [refine(problem, state.design, state.noise, p) for p in tried if p.evidence > ACCEPT]
+        return [p for p in tried if is_dissipative(problem, state.design, state.noise, p)]
+
+    chains = []
+    for proposal in likeliest(base, _BEGINNINGS):
+        state, strongest = base, proposal.evidence
+        while proposal is not None and proposal.evidence > max(ACCEPT, SHADOW * strongest):
+            terms = (*state.terms, problem.term(proposal.effect, proposal.deviation))
+            state = State(terms, base.noise, problem.design(terms, base.noise))
+            strongest = max(strongest, proposal.evidence)
+            proposal = next(iter(likeliest(state, 2)), None)
+        chains.append(state.terms[len(base.terms) :])
+    return chains
 
 
 def is_worthy(problem: Problem, state: State, proposal: Proposal, say: Any) -> bool:
