@@ -298,8 +298,12 @@ def _corrected(arm: Arm, premises: Premises, state: State) -> Corrected:
         effects.append(term.effect)
         values.append(jnp.asarray(x[at : at + len(term.deviation)] * term.deviation))
         at += len(term.deviation)
+    recorded = max(
+        float(t.motion.time[-1]) for t, on in zip(problem.traces, problem.active, strict=True) if on
+    )
     for i, term in enumerate(state.terms):
-        effects.append(term.effect)
+        drifts = hasattr(term.effect, "until")  # nobody knows how it goes on
+        effects.append(dataclasses.replace(term.effect, until=recorded) if drifts else term.effect)
         values.append(jnp.asarray(coefficients(problem, state, i)[0]))
     return Corrected(
         arm, jnp.asarray(change), jnp.asarray(damping), jnp.asarray(level), tuple(effects), tuple(values)

@@ -42,6 +42,7 @@ USUAL = {
     "friction_drift": -3.0,
     "joint_spring": -3.0,
     "torque_drift": -3.0,
+    "external_contact": -12.0,
     "backlash": -6.0,
     "joint_elasticity": -15.0,
     "time_delay": -20.0,
@@ -640,7 +641,13 @@ def _single(problem: Problem, design: Design, noise: Noise, effect: AbstractEffe
 
 
 def within(problem: Problem, effect: AbstractEffect) -> AbstractEffect:
-    """A change of payload kept inside its recording: beyond, it is a payload that was there throughout."""
+    """A change of payload kept inside its recording: beyond, it is a payload that was there throughout.
+
+    And a contact kept longer than what the filters of motion and torque resolve.
+    """
+    if isinstance(effect, ExternalContact) and effect.stop - effect.start < BIN:
+        middle = 0.5 * (float(effect.start) + float(effect.stop))
+        return dataclasses.replace(effect, start=middle - 0.5 * BIN, stop=middle + 0.5 * BIN)
     if not isinstance(effect, PayloadChange) or effect.form != "gained":
         return effect
     time = next(t.motion.time for t in problem.traces if t.name == effect.recording)

@@ -311,8 +311,9 @@ class FrictionDrift(AbstractDryFriction):
     $$\tau_j = g(t)\,(a \tanh(\dot q_j / v_0) + b\,\dot q_j) + F_c \tanh(\dot q_j / v_0) + F_v \dot q_j, \qquad
       g(t) = 1 - e^{-t/T}$$
 
-    A long time constant is a linear trend. Form "level" has `a` and `F_c` only, "slope" `b` and `F_v`, "both"
-    all; "... extra" leaves out the constant part.
+    A long time constant is a linear trend; what it came to is held after `until` [s], the end of what was
+    recorded. Form "level" has `a` and `F_c` only, "slope" `b` and `F_v`, "both" all; "... extra" leaves out the
+    constant part.
 
     References:
         Simoni et al., Robotica 2017; Wolf and Iskandar, ICRA 2018.
@@ -331,6 +332,7 @@ class FrictionDrift(AbstractDryFriction):
     time_constant: Float[Array, ""] | float
     v0: Float[Array, ""] | float
     form: str = eqx.field(static=True)
+    until: float = 1e9
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["FrictionDrift"]:
@@ -374,8 +376,11 @@ class FrictionDrift(AbstractDryFriction):
             }[self.form]
         )
 
+    def _share(self, s: Channels) -> Float[Array, ""]:
+        return -jnp.expm1(-jnp.minimum(s.t, self.until) / self.time_constant)
+
     def levels(self, s: Channels) -> Float[Array, " n"]:
-        g = -jnp.expm1(-s.t / self.time_constant)
+        g = self._share(s)
         one, none = jnp.ones_like(g), jnp.zeros_like(g)
         return jnp.stack(
             {
@@ -390,7 +395,7 @@ class FrictionDrift(AbstractDryFriction):
 
     def remainder(self, s: Channels) -> Float[Array, " n"]:
         qd = s.qd[self.joint]
-        slope, none = -jnp.expm1(-s.t / self.time_constant) * qd, jnp.zeros_like(qd)
+        slope, none = self._share(s) * qd, jnp.zeros_like(qd)
         return jnp.stack(
             {
                 "level extra": [none],

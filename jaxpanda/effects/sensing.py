@@ -91,7 +91,8 @@ class TorqueGain(AbstractInstantEffect):
 class TorqueDrift(AbstractInstantEffect):
     r"""Bias of a torque sensor that changes over time, $\tau_j = a\,g(t) + b$ with $g = 1 - e^{-t/T}$.
 
-    A long time constant is a linear trend. Form "extra" is without the constant; "wave" is
+    A long time constant is a linear trend; what it came to is held after `until` [s], the end of what was
+    recorded. Form "extra" is without the constant; "wave" is
     $a\,t + b + s \sin(2\pi t/T) + c \cos(2\pi t/T)$, a bias that wanders; "wandering" adds half the period to it.
     """
 
@@ -104,6 +105,7 @@ class TorqueDrift(AbstractInstantEffect):
     joint: Joint
     time_constant: Float[Array, ""] | float
     form: str = eqx.field(static=True)
+    until: float = 1e9
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["TorqueDrift"]:
@@ -133,10 +135,11 @@ class TorqueDrift(AbstractInstantEffect):
         )
 
     def at(self, s: Channels) -> Float[Array, " n"]:
-        one, phase = jnp.ones_like(s.t), s.t / self.time_constant
+        t = jnp.minimum(s.t, self.until)
+        one, phase = jnp.ones_like(t), t / self.time_constant
         if self.form in ("wave", "wandering"):
             w = 2 * jnp.pi * phase
-            wave = [s.t, one, jnp.sin(w), jnp.cos(w)]
+            wave = [t, one, jnp.sin(w), jnp.cos(w)]
             return jnp.stack(wave if self.form == "wave" else [*wave, jnp.sin(2 * w), jnp.cos(2 * w)])
         g = -jnp.expm1(-phase)
         return jnp.stack([g] if self.form == "extra" else [g, one])
