@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from .. import report
+from .. import markup, report
 from ..errors import InputError
 from ..files import output_folder, write_text
-from ..recordings import load, load_many
+from ..mjcf import from_document, from_mjcf
+from ..recordings import Recording, load, load_many
+from ..rollout import compare
 from . import page
 from .diagnosis import Diagnosis, diagnose, predict
 from .knowledge import Knowledge
@@ -52,10 +54,24 @@ def diagnose_files(
         found = diagnose(model, load_many(recordings), reference=load_many(reference), knowledge=knowledge)
         named = [*(("recording", p) for p in recordings), *(("reference", p) for p in reference)]
         sources = tuple(_source(role, path) for role, path in ([("model", model)] if model else []) + named)
-        found = dataclasses.replace(found, sources=sources)
+        found = _replayed(dataclasses.replace(found, sources=sources), model, load_many(recordings))
         found.save(folder)
         report.to_html("jaxpanda: diagnosis", page.sections(found), folder / "report.html")
     return found
+
+
+def _replayed(found: Diagnosis, model: Path | None, recordings: Sequence[Recording]) -> Diagnosis:
+    """With how closely both simulations follow a recording, the one in which something happened if any."""
+    if not found.findings:
+        return found
+    once = [f.recordings[0] for f in found.findings if f.intervals is not None]
+    recording = next((r for r in recordings if r.name in once), recordings[0])
+    own = markup.parse(found.model_xml, "mujoco", Path("panda.xml"))
+    source = (from_document(own) if model is None else from_mjcf(model))[1]
+    try:
+        return dataclasses.replace(found, replays=(compare(found.corrected, source, recording),))
+    except InputError as error:
+        return dataclasses.replace(found, notes=(*found.notes, f"not replayed in simulation: {error}"))
 
 
 def _source(role: str, path: Path) -> dict[str, str]:
