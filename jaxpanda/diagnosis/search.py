@@ -356,10 +356,11 @@ def handed_over(problem: Problem, state: State, say: Any) -> State:
             if isinstance(t.effect, Payload | InertialParameters) and t.effect.link == last
         ]
         events = [
-            i for i, t in enumerate(state.terms) if isinstance(t.effect, PayloadChange | ExternalContact)
+            (k, t.effect)
+            for k, t in enumerate(state.terms)
+            if isinstance(t.effect, PayloadChange | ExternalContact)
         ]
-        for i, k in itertools.product(bodies, events):
-            event = state.terms[k].effect
+        for i, (k, event) in itertools.product(bodies, events):
             others = tuple(t for n, t in enumerate(state.terms) if n not in (i, k))
             design = problem.design(others, state.noise)
             tried = []
