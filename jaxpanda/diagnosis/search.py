@@ -365,7 +365,7 @@ def handed_over(problem: Problem, state: State, say: Any) -> State:
             design = problem.design(others, state.noise)
             tried = []
             for form, at in (("lost", event.start), ("gained", event.stop), ("lost", event.stop)):
-                if abs(float(at)) > _BEYOND:
+                if abs(float(at)) >= _BEYOND:
                     continue
                 start, stop = (float(at), _BEYOND) if form == "gained" else (-_BEYOND, float(at))
                 effect = PayloadChange(last, start, stop, event.recording, form)
