@@ -106,7 +106,7 @@ def lower_bound(
 
 def _pseudo_inertias(dof: int) -> np.ndarray:
     """From phi to the pseudo-inertias' stacked upper triangles, off-diagonal entries times sqrt 2."""
-    of_units = np.asarray(jax.vmap(inertia.pseudo_inertia)(jnp.eye(10)))
+    of_units = np.asarray(jax.jit(jax.vmap(inertia.pseudo_inertia))(jnp.eye(10)))
     one = of_units[:, _ROW, _COLUMN].T
     return np.kron(np.eye(dof), np.where(_ROW == _COLUMN, 1.0, np.sqrt(2.0))[:, None] * one)
 

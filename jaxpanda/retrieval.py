@@ -357,7 +357,7 @@ def _described(
 ) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape 6"]]:
     """Mass, centre of mass, and xx yy zz xy xz yz of the inertia about it."""
     flat = phi.reshape(-1, 10)
-    mass, com, I_com = (np.asarray(x) for x in jax.vmap(inertia.to_com)(jnp.asarray(flat)))
+    mass, com, I_com = (np.asarray(x) for x in jax.jit(jax.vmap(inertia.to_com))(jnp.asarray(flat)))
     six = I_com[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     shape = phi.shape[:-1]
     return mass.reshape(shape), com.reshape(*shape, 3), six.reshape(*shape, 6)
@@ -389,7 +389,7 @@ def _margins(
 ) -> dict[str, Any]:
     """(value - lower, upper - value) of every box, the triangle inequality, and the user's margins."""
     mass, com, six = _described(phi)
-    I_com = np.asarray(jax.vmap(inertia.to_com)(jnp.asarray(phi))[2])
+    I_com = np.asarray(jax.jit(jax.vmap(inertia.to_com))(jnp.asarray(phi))[2])
     Sigma = 0.5 * np.trace(I_com, axis1=1, axis2=2)[:, None, None] * np.eye(3) - I_com
     pair = lambda value, box: [finite(value - box[0]), finite(box[1] - value)]
     links = Links.from_phi(jnp.asarray(phi))

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import inertia
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..errors import InputError
 from . import interior, small
@@ -47,6 +47,7 @@ _PRECISION = 1e-5
 _BOX_INSET = 1e-9  # [kg], [m]: m c / m need not give c to the last bit
 _LEAST_MASS = 1e-3  # [kg]: a link without mass is no body, and MuJoCo refuses it
 _SEGMENT = 3  # steps between two choices of who goes on
+_ROOM = 2  # for given starts: one program serves with them and without
 _INWARDS = 0.02  # how far random starts keep from their boxes, as a share of the way to the middle
 
 _ROW = np.array([0, 1, 1, 2, 2, 2])
@@ -92,7 +93,7 @@ def scaled_problem(
                 d[row] = -bound / weight
     size = unit[:, 0] * unit[:, 1] ** 2
     missed_in = inertia_unit(bounds, A / sigma)
-    A_scaled, b_scaled = jnp.asarray(scaled / sigma), jnp.asarray(b / sigma)
+    A_scaled, b_scaled = (jnp.asarray(part) for part in _compressed(scaled / sigma, b / sigma))
     return Problem(
         A=A_scaled,
         b=b_scaled,
@@ -115,6 +116,17 @@ def scaled_problem(
         dof=dof,
         boxed=bool(np.any(np.isfinite(inertia_box))),
     )
+
+
+def _compressed(
+    A: Float[np.ndarray, "rows columns"], b: Float[np.ndarray, " rows"]
+) -> tuple[Float[np.ndarray, "least columns"], Float[np.ndarray, " least"]]:
+    """The same sum of squares in one equation more than there are unknowns: one program serves any number."""
+    both, least = np.column_stack([A, b]), A.shape[1] + 1
+    if len(both) > least:
+        both = np.linalg.qr(both, mode="r")
+    both = np.concatenate([both, np.zeros((least - len(both), least))])
+    return both[:, :-1], both[:, -1]
 
 
 def _units(
@@ -273,35 +285,39 @@ class Origin(eqx.Module):
     """Where starts come from."""
 
     problem: Problem
-    given: Float[Array, "given columns"]
+    given: Float[Array, "room columns"]
     """Points to start from in place of random ones."""
+    count: Int[Array, ""]
+    """How many of them there are."""
     seed: Int[Array, ""]
 
 
 def origin_of(problem: Problem, seed: int, initial: Float[np.ndarray, "given dof 10"] | None) -> Origin:
-    given = jnp.zeros((0, len(problem.Q)))
+    given, count = jnp.zeros((_ROOM, len(problem.Q))), 0
     if initial is not None:
         if initial.shape[1:] != (problem.dof, 10):
             raise InputError(
                 f"initial parameters: expected shape (n, {problem.dof}, 10), got {initial.shape}"
             )
-        given = jax.jit(jax.vmap(_given_start, in_axes=(None, 0)))(problem, jnp.asarray(initial))
-    return Origin(problem, given, jnp.asarray(seed))
+        count = len(initial)
+        points = np.concatenate([initial, np.tile(initial[:1], (max(0, _ROOM - count), 1, 1))])
+        given = jax.jit(jax.vmap(_given_start, in_axes=(None, 0)))(problem, jnp.asarray(points))
+    return Origin(problem, given, jnp.asarray(count), jnp.asarray(seed))
 
 
 def _start(origin: Origin, number: Int[Array, ""]) -> Float[Array, " columns"]:
     """A given point where there is one of this number, else a random one."""
-    given = origin.given
+    given = origin.given[jnp.clip(number, 0, len(origin.given) - 1)]
     x0 = _random_start(origin.problem, jax.random.fold_in(jax.random.key(origin.seed), number))
-    return (
-        jnp.where(number < len(given), given[jnp.minimum(number, len(given) - 1)], x0) if len(given) else x0
-    )
+    return jnp.where(number < origin.count, given, x0)
 
 
 def solve_starts(origin: Origin, numbers: Int[Array, " chunk"], iterations: int, lanes: int) -> Outcome:
     x0 = jax.vmap(lambda number: _start(origin, number))(numbers)
     share = jnp.where(numbers < PRECISE, _PRECISION, TOLERANCE)
-    return solve_chunk(origin.problem, x0, iterations=iterations, tolerance=share, lanes=lanes)
+    return solve_chunk(
+        origin.problem, x0, iterations=iterations, tolerance=share, lanes=lanes, idle=numbers < 0
+    )
 
 
 def _random_start(problem: Problem, key: Key[Array, ""]) -> Float[Array, " columns"]:
@@ -376,11 +392,12 @@ def solve_chunk(
     iterations: int,
     tolerance: float | Float[Array, " starts"] = TOLERANCE,
     lanes: int = LANES["cpu"],
+    idle: Bool[Array, " starts"] | None = None,
 ) -> Outcome:
     """Minimise from every point of `x0`; a pure function to be compiled, no start knows of another.
 
     `lanes` of them take a few steps at a time, those that have taken the fewest first: what is done costs nothing
-    more, and no start waits for the slowest.
+    more, and no start waits for the slowest. `idle` ones stay where they are.
     """
     lanes, n = min(lanes, len(x0)), 10 * problem.dof
     left = lambda state: ~state.done & (state.steps < iterations)
@@ -392,6 +409,8 @@ def solve_chunk(
         return jax.tree.map(lambda whole, new: whole.at[..., chosen].set(new), state, part)
 
     state = interior.initialise(problem, x0.T, jnp.broadcast_to(jnp.asarray(tolerance, float), len(x0)))
+    if idle is not None:
+        state = eqx.tree_at(lambda state: state.done, state, idle)
     state = jax.lax.while_loop(lambda state: jnp.any(left(state)), go_on, state)
     phi = jnp.einsum("lpq,lqb->blp", problem.to_phi, state.u[:n].reshape(problem.dof, 10, -1))
     violation = jax.vmap(lambda phi: largest_violation(problem.limits, phi))(phi)

@@ -24,7 +24,10 @@ from jaxtyping import Array, Int, PyTree
 from .checkpoint import Checkpoint
 
 Chunk = Callable[..., PyTree[Array]]
-"""(problem, numbers of the starts, *options) -> arrays with a row for each of these starts."""
+"""(problem, numbers of the starts, *options) -> arrays with a row for each of these starts.
+
+A negative number fills a place that no start is left for; its row is not looked at.
+"""
 
 Device = Any
 """A `jax.Device`, which type checkers do not know."""
@@ -59,7 +62,6 @@ def run(
     """
     if checkpoint is not None and jax.process_index() == 0:
         checkpoint.require_same()
-    chunk = min(chunk, starts)
     devices = list(jax.local_devices() if devices is None else devices)
     mine = [device for device in devices if device.process_index == jax.process_index()]
     processes = collections.Counter(device.process_index for device in devices)
@@ -81,7 +83,8 @@ def run(
         progress(done, starts)
 
     def solved(device: int, first: int) -> list[Array]:
-        numbers = np.minimum(np.arange(chunk) + first, starts - 1)
+        numbers = np.arange(first, first + chunk)
+        numbers[numbers >= starts] = -1
         return jax.tree.leaves(programs[device](placed[device], jax.device_put(numbers, mine[device])))
 
     def begin(first: int) -> list[Future[list[Array]]]:
@@ -121,7 +124,6 @@ def run(
     )
 
 
-@functools.lru_cache(maxsize=16)
 def _compiled(
     solve: Chunk,
     options: tuple[Hashable, ...],
@@ -130,24 +132,32 @@ def _compiled(
     chunk: int,
     devices: tuple[Device, ...],
 ) -> tuple[list[Callable[..., PyTree[Array]]], PyTree[jax.ShapeDtypeStruct]]:
-    """The program for a chunk on each device; kept, because cross-validation solves one shape many times."""
+    """The program for a chunk on each device, and what it returns."""
+    of_one = functools.partial(_program, _jitted(solve, options, structure), shapes, chunk)
+    first = of_one(devices[0])  # where there is a compilation cache, it has the GPU's program from here on
+    with ThreadPoolExecutor(len(devices)) as pool:
+        programs = [first, *pool.map(of_one, devices[1:])]
+    return [program for program, _ in programs], first[1]
 
+
+@functools.lru_cache(maxsize=16)
+def _jitted(solve: Chunk, options: tuple[Hashable, ...], structure: Any) -> Any:
     def of_chunk(leaves: list[Array], numbers: Int[Array, " chunk"]) -> PyTree[Array]:
         return solve(jax.tree.unflatten(structure, leaves), numbers, *options)
 
-    jitted = jax.jit(of_chunk)
+    return jax.jit(of_chunk)
 
-    def lowered(device: Device) -> Any:
-        where = SingleDeviceSharding(device)
-        shaped = lambda shape, dtype: jax.ShapeDtypeStruct(shape, dtype, sharding=where)
-        leaves = [shaped(shape, dtype) for shape, dtype in shapes]
-        return jitted.lower(leaves, shaped((chunk,), jnp.asarray(0).dtype))
 
-    each = [lowered(device) for device in devices]
-    first = each[0].compile()  # where there is a compilation cache, it has the GPU's program from here on
-    with ThreadPoolExecutor(len(devices)) as pool:
-        others = list(pool.map(lambda one: one.compile(), each[1:]))
-    return [first, *others], each[0].out_info
+@functools.lru_cache(maxsize=64)
+def _program(
+    jitted: Any, shapes: tuple[tuple[tuple[int, ...], Any], ...], chunk: int, device: Device
+) -> tuple[Callable[..., PyTree[Array]], PyTree[jax.ShapeDtypeStruct]]:
+    """Kept, because cross-validation solves one shape many times."""
+    where = SingleDeviceSharding(device)
+    shaped = lambda shape, dtype: jax.ShapeDtypeStruct(shape, dtype, sharding=where)
+    leaves = [shaped(shape, dtype) for shape, dtype in shapes]
+    lowered = jitted.lower(leaves, shaped((chunk,), jnp.asarray(0).dtype))
+    return lowered.compile(), lowered.out_info
 
 
 def _taken_up(checkpoint: Checkpoint | None, outcome: tuple[np.ndarray, ...], shared: bool) -> int:

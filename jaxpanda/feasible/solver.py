@@ -109,12 +109,12 @@ def solve(
         origin = convex.origin_of(problem, seed, initial)
         kind = "cpu" if device.platform == "cpu" else "gpu"
         solve_starts, steps = convex.solve_starts, (rounds * iterations, convex.LANES[kind])
-        usual = convex.CHUNK[kind]
+        chunk = convex.CHUNK[kind] if chunk is None else chunk
     else:
         problem = newton.scaled_problem(A, b, bounds, constraints, extra_lower, extra_upper)
         origin = newton.origin_of(problem, bounds, seed, initial)
         solve_starts, steps = newton.solve_starts, (rounds, iterations)
-        usual = newton.CHUNK
+        chunk = min(newton.CHUNK if chunk is None else chunk, starts)
     kept = None
     if checkpoint is not None:
         further = (extra_lower, extra_upper, initial)
@@ -124,7 +124,7 @@ def solve(
         origin,
         steps,
         starts=starts,
-        chunk=usual if chunk is None else chunk,
+        chunk=chunk,
         devices=devices,
         checkpoint=kept,
         progress=progress,
