@@ -16,15 +16,19 @@ import pytest
 from jaxpanda import Arm, InputError, Recording
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
-from jaxpanda.diagnosis.decide import called
+from jaxpanda.diagnosis.decide import called, titles
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check
 from jaxpanda.diagnosis.noise import autoregression
+from jaxpanda.diagnosis.premises import pose
+from jaxpanda.diagnosis.problem import Term
+from jaxpanda.diagnosis.search import transferable, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.friction import StribeckFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
+from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.report import to_html
 
 NOISE = 0.05
@@ -187,6 +191,51 @@ def test_recordings_of_any_rate_come_on_two_grids_that_belong_together(rate):
 def test_friction_over_a_hair_s_breadth_is_coulomb_s():
     assert called(PreslidingHysteresis(2, 0.0008, "dahl whole")) == "coulomb_friction"
     assert called(PreslidingHysteresis(2, 0.003, "dahl whole")) == "presliding_hysteresis"
+
+
+def test_coulomb_s_friction_belongs_to_the_richer_law_at_its_joint():
+    term = lambda effect: Term(effect, (), np.ones(1))
+    sticks, stribeck = PreslidingHysteresis(3, 4e-4, "whole"), StribeckFriction(3, 0.1, 0.01, 2.0, "whole")
+    elsewhere = PreslidingHysteresis(4, 4e-4, "whole")
+    assert titles([term(sticks), term(stribeck), term(elsewhere)]) == [
+        "stribeck_friction",
+        "stribeck_friction",
+        "coulomb_friction",
+    ]
+
+
+@pytest.mark.slow
+def test_a_body_that_is_put_down_is_one_finding():
+    """Carried through the first recording and half of the second."""
+    body = np.concatenate([[0.5], 0.5 * np.array([0.02, -0.01, 0.17]), np.zeros(6)])
+    body[[4, 6, 9]] = 0.5 * 0.17**2, 0.5 * 0.17**2, 1e-4
+    own = lambda t, q, qd, qdd: (
+        Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)).regressor[:, :, 60:] @ body
+    )
+    until = lambda t, *s: own(t, *s) * (t < 4.0)[:, None]
+    found = diagnose(None, [record(10, own), record(11, until)]).findings
+    assert [(f.effect, f.joints, f.recordings) for f in found] == [
+        ("payload_change", (6,), ("motion_11.csv",))
+    ]
+    assert found[0].intervals is not None
+    np.testing.assert_allclose(found[0].intervals[0][1], 4.0, atol=0.1)
+    assert found[0].confidence > 0.5
+
+
+def test_what_fits_one_recording_only_is_left_out_of_the_corrected_model():
+    """An offset that changes sign between the recordings, and friction that does not."""
+    offset = lambda sign: lambda t, q, qd, qdd: np.eye(7)[1] * sign * np.ones((len(t), 1))
+    problem = pose(
+        tuple(prepare(record(k, offset(s)), Arm.panda()) for k, s in ((20, 1.5), (21, -0.5))),
+        (True, True), "exact",
+    ).problem  # fmt: skip
+    terms = [problem.term(TorqueOffset(1), np.array([1.0]))]
+    assert transferable(problem, with_terms(problem, terms)).terms == ()
+    same = pose(
+        tuple(prepare(record(k, offset(1.0)), Arm.panda()) for k in (20, 21)), (True, True), "exact"
+    ).problem
+    terms = [same.term(TorqueOffset(1), np.array([1.0]))]
+    assert len(transferable(same, with_terms(same, terms)).terms) == 1
 
 
 @pytest.mark.slow

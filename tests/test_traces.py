@@ -1,0 +1,89 @@
+"""What a sample of a recording is worth, and what its encoders put into it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxpanda import Arm, Recording
+from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.effects.friction import FrictionDrift, LoadDependentFriction
+from jaxpanda.effects.motion import Channels
+from jaxpanda.effects.sensing import TorqueDrift
+
+RATE, NOISE = 500.0, 0.05
+
+
+def moved(q: np.ndarray, seed: int = 0) -> Recording:
+    """The project's Panda with all joints offset by q(t), and torque that is noise."""
+    rng, arm = np.random.default_rng(seed), Arm.panda()
+    t = np.arange(len(q)) / RATE
+    q = 0.5 * np.asarray(arm.lower + arm.upper) + q[:, None] + 1e-5 * rng.normal(size=(len(q), 7))
+    return Recording("moved.csv", t, q, tau=NOISE * rng.normal(size=q.shape))
+
+
+def steps() -> np.ndarray:
+    """Two seconds at rest, two of a smooth step, two at rest."""
+    x = np.clip((np.arange(int(6 * RATE)) / RATE - 2) / 2, 0, 1)
+    return 0.6 * (10 * x**3 - 15 * x**4 + 6 * x**5)
+
+
+def test_samples_weigh_less_where_known_friction_has_no_known_sign():
+    rubs = dataclasses.replace(Arm.panda(), frictionloss=jnp.array([0.5, 0, 0, 0, 0, 0, 0]))
+    trace = prepare(moved(steps()), rubs)
+    t = trace.motion.time
+    assert np.all(trace.trust[(t > 2.4) & (t < 3.6), 0] == 1)  # it moves
+    assert np.all(trace.trust[(t < 1.8) | (t > 4.2), 0] < 0.4)  # it rests
+    assert np.all(trace.trust[(t < 1.8) | (t > 4.2), 1:] == 1)  # no friction is known there
+
+
+def test_samples_weigh_less_where_motion_is_sharper_than_its_filter():
+    t = np.arange(int(6 * RATE)) / RATE
+    trace = prepare(moved(0.5 * np.abs(np.sin(0.5 * np.pi * t))), Arm.panda())  # speed jumps at 2 s and 4 s
+    jump = np.minimum(np.abs(trace.motion.time - 2), np.abs(trace.motion.time - 4))
+    assert np.all(trace.trust[jump < 0.02, 0] < 0.2)
+    assert np.all(trace.trust[jump > 0.3] == 1)
+
+
+def test_shaken_columns_are_the_inertial_torque_of_fast_accelerations():
+    """Their sum over joints and bands is M times the acceleration of a vibration, without that of the motion."""
+    t = np.arange(int(6 * RATE)) / RATE
+    slow, fast = 0.5 * np.sin(2 * np.pi * 0.3 * t), 1e-3 * np.sin(2 * np.pi * 7.0 * t)
+    trace = prepare(moved(slow + fast), Arm.panda())
+    motion = trace.motion
+    vibration = -1e-3 * (2 * np.pi * 7.0) ** 2 * np.sin(2 * np.pi * 7.0 * motion.time)
+    expected = motion.mass.sum(2) * vibration[:, None]
+    assert trace.shaken.shape == (motion.samples, 7, 14)
+    inner = slice(30, -30)
+    difference = (trace.shaken.sum(2) - expected)[inner]
+    assert np.sqrt(np.mean(difference**2)) < 0.15 * np.sqrt(np.mean(expected[inner] ** 2))
+
+
+def test_friction_that_gear_teeth_carry_is_load_dependent_and_directed():
+    r"""$F = \mu |\tau + F \operatorname{sign} \dot q|$, solved exactly."""
+    rng, mu = np.random.default_rng(0), 0.15
+    load, qd = rng.uniform(-20, 20, 400), rng.choice([-1.0, 1.0], 400)
+    drives = load * qd > 0
+    friction = qd * np.abs(load) * np.where(drives, mu / (1 - mu), mu / (1 + mu))
+    wide = lambda x: jnp.zeros((400, 2)).at[:, 0].set(x)
+    s = Channels(jnp.zeros(400), wide(0), wide(qd), wide(0), wide(load), wide(load))
+
+    def left(form: str) -> float:
+        law = LoadDependentFriction(0, 0.001, 1.0, form)
+        A = np.asarray(jax.vmap(law.at)(s))
+        c = np.linalg.lstsq(A, friction, rcond=None)[0]
+        return float(np.linalg.norm(A @ c - friction) / np.linalg.norm(friction))
+
+    assert left("") > 0.1
+    assert left("directed") < 1e-6
+
+
+@pytest.mark.parametrize(
+    "drift", [FrictionDrift(0, 5.0, 0.01, "both", until=10.0), TorqueDrift(0, 5.0, "wandering", until=10.0)]
+)
+def test_a_drift_holds_where_the_recording_ended(drift):
+    at = lambda t: drift.at(Channels(jnp.asarray(t), *(jnp.ones(2),) * 5))
+    np.testing.assert_array_equal(at(10.0), at(30.0))
+    assert np.abs(at(9.0) - at(10.0)).max() > 1e-3
