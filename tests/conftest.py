@@ -13,7 +13,7 @@ jax.config.update("jax_enable_x64", True)
 def data() -> Path:
     """The folder of real recordings; tests that need it are skipped where it is absent."""
     default = Path(__file__).parents[2] / "shared" / "data"
-    folder = Path(os.environ.get("JAXPANDA_DATA", default))
+    folder = Path(os.environ.get("JAXPANDA_DATA") or default)
     if not folder.is_dir():
         pytest.skip("no real recordings here: set JAXPANDA_DATA to the folder that holds them")
     return folder
