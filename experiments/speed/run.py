@@ -371,6 +371,8 @@ def on_gpus(quick: bool) -> dict:
         text += f"compile {found['first']['compile']:.1f} s"
         name = f"good starts a second, {starts:,} starts, {count} x {found['device']}"
         table.row(name, text, rate=rates, **found)
+    if single is None:
+        return table.figures
     many = starts if quick else 1_000_000
     alone = {"JAXPANDA_CACHE": "", "CUDA_VISIBLE_DEVICES": "0"}
     whole = child("million", None, alone, starts=many)
