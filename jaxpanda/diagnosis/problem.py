@@ -281,7 +281,12 @@ class Problem:
                 dg += out.T @ missing
         error = 0.0
         for (_, test), (dH, dg) in zip(folds, less, strict=True):
-            x = scipy.linalg.solve(H - dH, g - dg, assume_a="pos") if len(g) else g
+            unit = 1 / np.sqrt(np.diag(H - dH))  # coefficients differ in size by their units
+            x = g
+            if len(g):
+                x = unit * scipy.linalg.solve(
+                    unit[:, None] * (H - dH) * unit, unit * (g - dg), assume_a="pos"
+                )
             for A, r in zip(design.columns, design.residual, strict=True):
                 rows = test if counts is None else test & counts
                 error += float(np.sum((r[rows] - A[rows] @ x) ** 2))
