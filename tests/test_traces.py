@@ -47,6 +47,16 @@ def test_samples_weigh_less_where_motion_is_sharper_than_its_filter():
     assert np.all(trace.trust[jump > 0.3] == 1)
 
 
+def test_a_joint_that_never_moves_tells_nothing():
+    """Friction at rest may carry its load."""
+    recording = moved(steps())
+    q = recording.q.copy()
+    q[:, 2] = 0.3 + 1e-5 * np.random.default_rng(5).normal(size=len(q))
+    trace = prepare(dataclasses.replace(recording, q=q), Arm.panda())
+    assert not trace.weights[:, 2].any()
+    assert trace.weights[:, [0, 1, 3, 4, 5, 6]].all()
+
+
 def test_shaken_columns_are_the_inertial_torque_of_fast_accelerations():
     """Their sum over joints and bands is M times the acceleration of a vibration, without that of the motion."""
     t = np.arange(int(6 * RATE)) / RATE

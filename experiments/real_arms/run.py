@@ -17,6 +17,7 @@ from oracle import cross_validated, held_out_rmse, nested
 
 from jaxpanda import session
 from jaxpanda.diagnosis import Diagnosis, diagnose
+from jaxpanda.diagnosis.knowledge import Knowledge
 from jaxpanda.effects import AbstractEffect
 from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
 from jaxpanda.effects.load import GravityDirection, Payload
@@ -52,10 +53,11 @@ def trial(
     oracle: Oracle,
     out: Path,
     reference: Sequence[Recording] = (),
+    knowledge: Knowledge = "identified",
 ) -> Diagnosis:
     """Diagnose, print, and keep what was found."""
     started = time.perf_counter(), time.process_time()
-    found = diagnose(model, recordings, reference=reference)
+    found = diagnose(model, recordings, reference=reference, knowledge=knowledge)
     wall, cpu = time.perf_counter() - started[0], time.process_time() - started[1]
     print(f"\n## {title}\nverdict: {found.verdict} ({wall:.0f} s, of which {cpu:.0f} s of processor)")
     for note in found.notes:
@@ -141,13 +143,18 @@ def iiwa(data: Path, out: Path, _: bool) -> None:
             ViscousFriction(j),
         ]
         trial(
-            f"iiwa J{joint} chirp: delay and friction concealed", model, real.iiwa(data, chirp), oracle, out
+            f"iiwa J{joint} chirp: delay and friction concealed",
+            model,
+            real.iiwa(data, chirp),
+            oracle,
+            out,
+            knowledge="rough",
         )
     sweeps = [
         run for name in ("friction_joint1_vel_p15", "friction_joint1_vel_p6") for run in real.iiwa(data, name)
     ]
     oracle = lambda arm: [CoulombFriction(0, 0.01), ViscousFriction(0), TorqueOffset(0)]
-    trial("iiwa J1 sweeps: friction concealed", model, sweeps, oracle, out)
+    trial("iiwa J1 sweeps: friction concealed", model, sweeps, oracle, out, knowledge="rough")
 
 
 def kinova(data: Path, out: Path, _: bool) -> None:

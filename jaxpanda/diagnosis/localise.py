@@ -175,6 +175,9 @@ def unbiased(problem: Problem, terms: Sequence[Term], noise: Noise) -> Noise:
         ) / max(weights[:, j].sum(), 1.0)
 
     for j in range(problem.dof):
+        if not weights[:, j].any():
+            a[j], sigma[j], std[j] = noise.a[j], noise.sigma[j], noise.std[j]
+            continue
         here = [t for t in terms if any(np.any(c[:, j]) for c in t.columns)]
         extra = [
             np.concatenate([problem.ripples[j][r], *(t.columns[r][:, j] for t in here)], 1)

@@ -14,12 +14,14 @@ from ..effects import AbstractEffect, AbstractJointEffect
 from . import catchall
 from .evidence import Design, Noise, OnDemand
 from .library import Candidates, build, columns_of
-from .noise import autoregression, saturated_residual, strongest_order
+from .noise import ORDER, autoregression, saturated_residual, strongest_order
 from .scan import Block, Family, Score, Whitened, families, parallel, projected, scan
 from .traces import Trace
 
 _MEMORY = 1 << 28
 """Bytes of columns of shapes off the grid that are kept."""
+_UNHEARD = 1e9
+"""Innovations of a joint that no recording tells anything about [N m]."""
 FOLDS = 5
 """Blocks of the cross-validation."""
 
@@ -315,6 +317,10 @@ class Problem:
         """Noise that a saturated model with these terms leaves; of a joint it depends on what acts there."""
 
         def one(joint: int) -> tuple:
+            if not any(np.any(t.trust[:, joint]) for t in self.traces):
+                taus = [t.signals.tau for t in self.traces if t.signals.tau is not None]
+                quiet = float(np.median([signals_.white_noise(tau)[joint] for tau in taus]))
+                return np.zeros(ORDER), _UNHEARD, quiet
             here = [t for t in (*self.background, *terms) if any(np.any(c[:, joint]) for c in t.columns)]
             key = joint, *(id(t) for t in here)
             if key not in self._noises:

@@ -38,6 +38,8 @@ _SHAKEN = (2.5, 5.0)
 """Where the bands begin in which noise of q, differentiated twice, may outweigh the motion [Hz]."""
 _SHARPER, _SHARP = 2.5, 6.0
 """Where motion is looked for that a filter took away, in its cutoffs; and how far above noise it must be."""
+_STILL = 3e-3
+"""Travel below which a joint stands still in a recording [rad]."""
 _BESIDE = 0.02
 """How far the low-pass of the torque and the noise model carry a wrong sign [s]."""
 _AT_ONCE = 24
@@ -77,7 +79,8 @@ class Trace:
     """Share of its frictionloss at which each joint's friction stands, on the fine grid."""
     trust: Float[np.ndarray, "time dof"]
     """What a sample weighs in each joint, 0 to 1: less where nothing tells which way known friction points, and
-    where the motion is sharper than the filter of q lets through."""
+    where the motion is sharper than the filter of q lets through; none where the joint never moves, as friction
+    at rest may carry any part of its load."""
 
     @property
     def weights(self) -> Float[np.ndarray, "time dof"]:
@@ -180,6 +183,8 @@ def prepare(
         cut_off = _cut_off(position, qdd, cutoff_q, rate)[keep]
         unsure = np.hypot(unsure, (np.abs(motion.mass) @ cut_off[:, :, None])[:, :, 0])
         trust = 1 / np.sqrt(1 + (unsure / np.maximum(noise, 1e-12)) ** 2)
+        if not whole:
+            trust[:, np.ptp(motion.q, axis=0) < _STILL] = 0.0
     return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust)
 
 
