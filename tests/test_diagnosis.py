@@ -222,6 +222,15 @@ def test_a_body_that_is_put_down_is_one_finding():
     assert found[0].confidence > 0.5
 
 
+def test_a_joint_that_never_moved_is_not_judged_and_that_is_said():
+    one = record(30, lambda t, q, qd, qdd: np.eye(7)[3] * 5.0 * np.ones((len(t), 1)))
+    q = one.q.copy()
+    q[:, 3] = q[:, 3].mean()
+    found = diagnose(None, [dataclasses.replace(one, q=q)])
+    assert not any(3 in f.joints for f in found.findings if f.effect == "torque_offset")
+    assert any("joint 4 never moved" in note for note in found.notes)
+
+
 def test_what_fits_one_recording_only_is_left_out_of_the_corrected_model():
     """An offset that changes sign between the recordings, and friction that does not."""
     offset = lambda sign: lambda t, q, qd, qdd: np.eye(7)[1] * sign * np.ones((len(t), 1))

@@ -27,7 +27,7 @@ from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
 from .search import State, transferable
-from .traces import prepare
+from .traces import Trace, prepare
 
 CORRECTED = "corrected.json"
 """What `predict` reads."""
@@ -207,7 +207,13 @@ def diagnose(
         fit=fit(problem, kept),
         corrected=corrected,
         corrected_xml=text,
-        notes=(*premises.notes, *repairs, *(n for t in traces for n in t.signals.notes), *warnings),
+        notes=(
+            *premises.notes,
+            *repairs,
+            *(n for t in traces for n in _still(t)),
+            *(n for t in traces for n in t.signals.notes),
+            *warnings,
+        ),
         log=tuple(log),
         problem=problem,
         state=state,
@@ -215,6 +221,18 @@ def diagnose(
         knowledge=premises.knowledge,
         spread=premises.spread,
     )
+
+
+def _still(trace: Trace) -> list[str]:
+    """A sentence about the joints that stand still in a recording."""
+    joints = [str(j + 1) for j in np.flatnonzero(~trace.trust.any(0))]
+    if not joints:
+        return []
+    named = f"joint{'s' * (len(joints) > 1)} {', '.join(joints)}"
+    return [
+        f"{trace.name}: {named} never moved; friction at rest may carry any part of the load there, so that"
+        " torque was not judged"
+    ]
 
 
 def _require_live_torque(recording: Recording) -> None:
