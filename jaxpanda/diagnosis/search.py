@@ -121,7 +121,8 @@ def finish(problem: Problem, state: State, say: Any) -> State:
 def everywhere(problem: Problem, noise: Noise) -> list[Term]:
     """For each joint what simple effects explain of it together."""
     base = State((), noise, problem.design((), noise))
-    found = [max(_chains(problem, base, joint), key=len, default=()) for joint in range(problem.dof)]
+    evidence = lambda chain: problem.design(chain, noise).log_evidence
+    found = [max(_chains(problem, base, joint), key=evidence, default=()) for joint in range(problem.dof)]
     return [term for chain in found for term in chain]
 
 
