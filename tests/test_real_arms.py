@@ -9,6 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from jaxpanda import load
+from jaxpanda.diagnosis import diagnose
 from jaxpanda.errors import InputError
 
 FOLDER = Path(__file__).parents[1] / "experiments" / "real_arms"
@@ -105,3 +107,14 @@ def test_the_recordings_read_as_their_authors_describe(experiment, data):
     (run,) = real.iiwa(data, "J6_chirp")
     assert run.tau is not None
     assert np.ptp(run.q[:, 5]) > 10 * np.ptp(run.q[:, 0])
+
+
+@pytest.mark.slow
+def test_the_real_panda_s_hysteresis_is_found_and_most_of_its_error_goes(data):
+    """Published links, no friction: the first finding is presliding, J7 among its joints."""
+    found = diagnose(None, [load(data / "gaz_panda")])
+    assert found.findings[0].effect == "presliding_hysteresis"
+    assert {4, 6} <= set(found.findings[0].joints)
+    assert found.fit.held_out_rmse_after[6] < 0.15 * found.fit.held_out_rmse_before[6]
+    ratio = found.fit.held_out_rmse_after / found.fit.held_out_rmse_before
+    assert np.all(ratio < 0.7)
