@@ -51,10 +51,11 @@ def diagnose_files(
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
     with output_folder(out) as folder:
-        found = diagnose(model, load_many(recordings), reference=load_many(reference), knowledge=knowledge)
+        loaded = load_many(recordings)
+        found = diagnose(model, loaded, reference=load_many(reference), knowledge=knowledge)
         named = [*(("recording", p) for p in recordings), *(("reference", p) for p in reference)]
         sources = tuple(_source(role, path) for role, path in ([("model", model)] if model else []) + named)
-        found = _replayed(dataclasses.replace(found, sources=sources), model, load_many(recordings))
+        found = _replayed(dataclasses.replace(found, sources=sources), model, loaded)
         found.save(folder)
         report.to_html("jaxpanda: diagnosis", page.sections(found), folder / "report.html")
     return found

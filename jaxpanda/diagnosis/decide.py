@@ -76,9 +76,9 @@ def findings(problem: Problem, state: State) -> list[Finding]:
     groups = together(problem, state.terms)
     before, after = leftover(state)
     left = np.clip(after / np.maximum(before, 1e-9), 0, 1) * (after > LEFT_CLEAR)
-    names = set(titles(state.terms))
-    doubt = CROWD ** max(0, len(names) - 2) * np.exp(-DOUBT * shares(state) @ left)
-    out = [_finding(problem, state, places, rivals, doubt) for places in groups]
+    names = titles(state.terms)
+    doubt = CROWD ** max(0, len(set(names)) - 2) * np.exp(-DOUBT * shares(state) @ left)
+    out = [_finding(problem, state, places, names[places[0]], rivals, doubt) for places in groups]
     return sorted(out, key=lambda f: -f.evidence)
 
 
@@ -169,11 +169,11 @@ def _finding(
     problem: Problem,
     state: State,
     places: Sequence[int],
+    name: str,
     rivals: Sequence,
     doubt: Float[np.ndarray, " terms"],
 ) -> Finding:
     terms = [state.terms[i] for i in places]
-    name = titles(state.terms)[places[0]]
     effect = next((t.effect for t in terms if t.effect.name == name), terms[0].effect)
     joints = tuple(sorted({j for t in terms for j in t.effect.joints}))
     if effect.bound_to_recording:  # what happened at once happened at one place

@@ -13,7 +13,7 @@ from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import Backlash
 from ..effects.friction import AsymmetricFriction
-from ..effects.load import InertialParameters, Payload, PayloadChange
+from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
 from .events import BIN, Proposal, ripple, windows
 from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
 from .library import Candidates
@@ -66,7 +66,6 @@ _SIMPLE = ("viscous_friction", "coulomb_friction", "presliding_hysteresis", "tor
 _BEGINNINGS = 2
 """Simpler effects from which a joint is built up again."""
 _GIVEN = 0.2
-_BEYOND = 1e9  # [s]: no recording is as long
 _PAID = 8.0  # [nats]: for the search of when a body changes hands
 CLEAR = 4.0
 """Standard deviations by which a gap must differ from none."""
@@ -299,8 +298,9 @@ def transferable(problem: Problem, state: State) -> State:
     What stands in for physics that has no name fits where it was fitted, and misleads elsewhere.
     """
     while True:
+        whole = problem.transferred_error(state.design)
         harm = {
-            i: problem.transferred_error(state.design) - problem.transferred_error(without(state, i))
+            i: whole - problem.transferred_error(without(state, i))
             for i, t in enumerate(state.terms)
             if not t.effect.bound_to_recording
         }
@@ -366,9 +366,9 @@ def handed_over(problem: Problem, state: State, say: Any) -> State:
             design = problem.design(others, state.noise)
             tried = []
             for form, at in (("lost", event.start), ("gained", event.stop), ("lost", event.stop)):
-                if abs(float(at)) >= _BEYOND:
+                if abs(float(at)) >= EVER:
                     continue
-                start, stop = (float(at), _BEYOND) if form == "gained" else (-_BEYOND, float(at))
+                start, stop = (float(at), EVER) if form == "gained" else (-EVER, float(at))
                 effect = PayloadChange(last, start, stop, event.recording, form)
                 best, deviation = _single(problem, design, state.noise, effect)
                 proposal = Proposal(effect, best, best, deviation, first_steps(effect))

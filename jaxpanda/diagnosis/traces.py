@@ -244,14 +244,6 @@ def _cut_off(
     return scipy.ndimage.maximum_filter1d(lost, 2 * round(rate * 2 * _BESIDE) + 1, axis=0)
 
 
-def _distance(
-    rows: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " time"]
-) -> Float[np.ndarray, " time"]:
-    """From each point of the grid to the nearest row [s]."""
-    after = np.clip(np.searchsorted(rows, grid), 1, len(rows) - 1)
-    return np.minimum(np.abs(rows[after] - grid), np.abs(grid - rows[after - 1]))
-
-
 def held_sign(
     arm: Arm,
     qd: Float[np.ndarray, "time dof"],

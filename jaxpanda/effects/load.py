@@ -187,7 +187,7 @@ class PayloadChange(AbstractArmEffect):
         if recording == self.recording:
             return self
         there = later is not None and later == (self.form == "gained")
-        return dataclasses.replace(self, start=-_EVER, stop=_EVER) if there else None
+        return dataclasses.replace(self, start=-EVER, stop=EVER) if there else None
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -230,7 +230,7 @@ class PayloadChange(AbstractArmEffect):
         return _as_body(self, self._basis[0], c, covariance) + when
 
 
-_EVER = 1e9
+EVER = 1e9
 """Seconds that no recording reaches."""
 
 

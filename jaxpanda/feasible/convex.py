@@ -27,6 +27,7 @@ from .outcome import (
     TRIANGLE_INSET,
     Outcome,
     extra_box,
+    extra_unit,
     inertia_inset,
     inertia_unit,
     largest_violation,
@@ -50,8 +51,7 @@ _SEGMENT = 3  # steps between two choices of who goes on
 _ROOM = 2  # for given starts: one program serves with them and without
 _INWARDS = 0.02  # how far random starts keep from their boxes, as a share of the way to the middle
 
-_ROW = np.array([0, 1, 1, 2, 2, 2])
-_COLUMN = np.array([0, 0, 1, 0, 1, 2])
+_ROW, _COLUMN = np.tril_indices(3)
 
 
 def scaled_problem(
@@ -69,10 +69,7 @@ def scaled_problem(
     unit = _units(A, b, bounds, inertia_box)
     centre = bounds.com.mean(-1)
     to_phi = _to_phi(unit, centre)
-    norms = np.linalg.norm(A[:, 10 * dof :], axis=0)
-    of_extra = np.where(norms > 0, np.linalg.norm(b) / np.where(norms > 0, norms, 1), 0)
-    of_extra = np.minimum(of_extra, np.where(high > low, high - low, np.inf))
-    of_extra = np.where(of_extra > 0, of_extra, 1.0)
+    of_extra = extra_unit(A[:, 10 * dof :], b, low, high)
     scaled = np.concatenate(
         [
             _of_entries(A, to_phi),

@@ -40,6 +40,7 @@ from .outcome import (
     Limits,
     Outcome,
     extra_box,
+    extra_unit,
     inertia_inset,
     inertia_unit,
     largest_violation,
@@ -58,8 +59,7 @@ _MOST_BEND = 0.375
 _WEIGHT = 1.0
 _LEAST_MASS = 1e-3  # [kg]: a link without mass is no body, and MuJoCo refuses it
 
-_ROW = np.array([0, 1, 1, 2, 2, 2])
-_COLUMN = np.array([0, 0, 1, 0, 1, 2])
+_ROW, _COLUMN = np.tril_indices(3)
 _SAME_COLUMN = (_COLUMN[:, None] == _COLUMN).astype(float)
 
 
@@ -107,9 +107,7 @@ def scaled_problem(
     order = np.stack([scale[:, 0], scale[:, 0] * size, scale[:, 4] ** 2], -1)
     order = order[:, [0, 1, 1, 1, 2, 2, 2, 2, 2, 2]].ravel()
     norms = np.linalg.norm(A, axis=0)
-    of_extra = np.where(norms > 0, np.linalg.norm(b) / np.where(norms > 0, norms, 1), 0)[10 * dof :]
-    of_extra = np.minimum(of_extra, np.where(high > low, high - low, np.inf))
-    of_extra = np.where(of_extra > 0, of_extra, 1.0)
+    of_extra = extra_unit(A[:, 10 * dof :], b, low, high)
     sigma = np.sqrt(np.mean((norms * np.concatenate([order, of_extra])) ** 2)) or 1.0
     A_scaled, b_scaled = jnp.asarray(A / sigma), jnp.asarray(b / sigma)
     return Problem(
@@ -144,23 +142,6 @@ def _root_inertia(bounds: Bounds) -> Float[np.ndarray, " dof"]:
     """Typical entry of L: what a link of middling mass with half its box for a radius of gyration has."""
     radius = 0.5 * np.linalg.norm(bounds.com[..., 1] - bounds.com[..., 0], axis=-1) + 0.02
     return radius * np.sqrt(bounds.mass.mean(-1))
-
-
-def starting_points(
-    problem: Problem,
-    bounds: Bounds,
-    starts: int,
-    seed: int,
-    *,
-    first: int = 0,
-    initial: Float[np.ndarray, "given dof 10"] | None = None,
-) -> Float[Array, "starts columns"]:
-    """Starts number `first`, `first` + 1, ...: random points of the box, the given ones in place of the first.
-
-    A start depends on its number and the seed alone.
-    """
-    drawn = jax.jit(jax.vmap(_start, in_axes=(None, 0)))
-    return drawn(origin_of(problem, bounds, seed, initial), first + jnp.arange(starts))
 
 
 class Origin(eqx.Module):

@@ -62,6 +62,19 @@ def _largest_inertia(bounds: Bounds) -> Float[np.ndarray, " dof"]:
     return np.where(found > 0, found, 1.0)
 
 
+def extra_unit(
+    columns: Float[np.ndarray, "rows extra"],
+    b: Float[np.ndarray, " rows"],
+    low: Float[np.ndarray, " extra"],
+    high: Float[np.ndarray, " extra"],
+) -> Float[np.ndarray, " extra"]:
+    """A typical size of each unknown beside the links: what alone would explain b, or its box if narrower."""
+    norms = np.linalg.norm(columns, axis=0)
+    unit = np.where(norms > 0, np.linalg.norm(b) / np.where(norms > 0, norms, 1), 0)
+    unit = np.minimum(unit, np.where(high > low, high - low, np.inf))
+    return np.where(unit > 0, unit, 1.0)
+
+
 class Limits(eqx.Module):
     """What the links must meet, in SI units."""
 
