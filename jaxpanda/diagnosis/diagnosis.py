@@ -186,6 +186,12 @@ def diagnose(
             _require_live_torque(recording)
             traces.append(prepare(recording, arm))
             active.append(on)
+    suspect = [trace for trace, on in zip(traces, active, strict=True) if on]
+    if not any(trace.trust.any() for trace in suspect):
+        raise InputError(
+            f"{', '.join(trace.name for trace in suspect)}: no joint moves; friction at rest may carry any load, so"
+            " that a diagnosis needs motion"
+        )
     log: list[str] = []
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
     problem = premises.problem
