@@ -189,8 +189,8 @@ def diagnose(
     suspect = [trace for trace, on in zip(traces, active, strict=True) if on]
     if not any(trace.trust.any() for trace in suspect):
         raise InputError(
-            f"{', '.join(trace.name for trace in suspect)}: no joint moves; friction at rest may carry any load, so"
-            " that a diagnosis needs motion"
+            f"{', '.join(trace.name for trace in suspect)}: no joint moves; friction at rest may carry any load,"
+            " so that a diagnosis needs motion"
         )
     log: list[str] = []
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
