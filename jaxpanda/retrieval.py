@@ -352,12 +352,15 @@ def _towards(
     return pulled.phi[np.argmin(np.where(nearer, pulled.objective, np.inf))] if nearer.any() else best
 
 
+_to_com = jax.jit(jax.vmap(inertia.to_com))
+
+
 def _described(
     phi: Float[np.ndarray, "*shape 10"],
 ) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape 6"]]:
     """Mass, centre of mass, and xx yy zz xy xz yz of the inertia about it."""
     flat = phi.reshape(-1, 10)
-    mass, com, I_com = (np.asarray(x) for x in jax.jit(jax.vmap(inertia.to_com))(jnp.asarray(flat)))
+    mass, com, I_com = (np.asarray(x) for x in _to_com(flat))
     six = I_com[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     shape = phi.shape[:-1]
     return mass.reshape(shape), com.reshape(*shape, 3), six.reshape(*shape, 6)
@@ -366,9 +369,12 @@ def _described(
 def _spread(
     phi: Float[np.ndarray, "starts dof 10"], chosen: Bool[np.ndarray, " starts"]
 ) -> dict[str, tuple[float, float]]:
-    """Over the chosen starts, in blocks, which bounds the memory."""
+    """Over the chosen starts, in blocks of one size, which bounds the memory and compiles once."""
     numbers = np.flatnonzero(chosen)
-    blocks = [_extremes(phi[numbers[i : i + _BLOCK]]) for i in range(0, len(numbers), _BLOCK)]
+    blocks = []
+    for first in range(0, len(numbers), _BLOCK):
+        here = np.minimum(np.arange(first, first + _BLOCK), len(numbers) - 1)
+        blocks.append(_extremes(phi[numbers[here]]))
     low = {name: min(block[name][0] for block in blocks) for name in blocks[0]}
     return {name: (low[name], max(block[name][1] for block in blocks)) for name in low}
 
@@ -389,7 +395,7 @@ def _margins(
 ) -> dict[str, Any]:
     """(value - lower, upper - value) of every box, the triangle inequality, and the user's margins."""
     mass, com, six = _described(phi)
-    I_com = np.asarray(jax.jit(jax.vmap(inertia.to_com))(jnp.asarray(phi))[2])
+    I_com = np.asarray(_to_com(phi)[2])
     Sigma = 0.5 * np.trace(I_com, axis1=1, axis2=2)[:, None, None] * np.eye(3) - I_com
     pair = lambda value, box: [finite(value - box[0]), finite(box[1] - value)]
     links = Links.from_phi(jnp.asarray(phi))

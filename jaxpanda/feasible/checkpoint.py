@@ -104,9 +104,10 @@ class Checkpoint:
         rows = np.empty(len(parts[0]), self._row)
         for name, part in zip(self._row.names or (), parts, strict=True):
             rows[name] = part
-        block = rows.tobytes()
+        block = rows.data
         with self.path.open("ab") as file:
-            file.write(_BLOCK.pack(first, len(rows), zlib.crc32(block)) + block)
+            file.write(_BLOCK.pack(first, len(rows), zlib.crc32(block)))
+            file.write(block)
 
     def remove(self) -> None:
         """The run is over and its result saved."""

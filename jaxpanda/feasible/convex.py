@@ -34,7 +34,7 @@ from .outcome import (
     limits_of,
 )
 
-CHUNK = {"cpu": 256, "gpu": 65536}
+CHUNK = {"cpu": 256, "gpu": 262144}
 """Starts handed to a device at once, by its platform."""
 LANES = {"cpu": 16, "gpu": 8192}
 """How many of them take their steps together. A processor's cache holds 16 of the steps' matrices, not 128; and

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from . import small
+from . import definite, small
 from .outcome import XYZ_COLUMN, XYZ_ROW, Limits
 
 # Where m, h and Sigma stand among the ten entries of a link's scaled pseudo-inertia, `small.PAIRS`.
@@ -257,14 +257,8 @@ def step(problem: Problem, state: State, most: int) -> State:
     # The next target is not known yet; a tenth of mu is about right.
     nearness = 0.1 * _NEARNESS * mu
     H = _assemble(problem, blocks, state.z / s, state.damping + nearness)
-    factor = jax.lax.linalg.cholesky(H, symmetrize_input=False)
-
-    def solve(rhs: Float[Array, "columns lanes"]) -> Float[Array, "columns lanes"]:
-        x = rhs.T[..., None]
-        for transpose in (False, True):
-            x = jax.lax.linalg.triangular_solve(factor, x, left_side=True, lower=True, transpose_a=transpose)
-        return x[..., 0].T
-
+    factor = definite.factor(H)
+    solve = lambda rhs: definite.solve(factor, rhs.T).T
     nothing_left = 1e-14 * jnp.sum(problem.b**2)
     solved = state.tolerance * value.objective + nothing_left
 
