@@ -17,6 +17,7 @@ from ..rollout import compare
 from . import page
 from .diagnosis import Diagnosis, diagnose, predict
 from .knowledge import Knowledge
+from .scan import one_blas_thread
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Prediction:
         return [f"{self.rows} rows of torque in {self.path}."]
 
 
+@one_blas_thread
 def diagnose_files(
     out: Path,
     model: Path | None,

@@ -26,6 +26,7 @@ from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
+from .scan import one_blas_thread
 from .search import State, transferable
 from .traces import Trace, prepare
 
@@ -152,6 +153,7 @@ class Diagnosis:
             self.next_motion.save(folder / NEXT_MOTION)
 
 
+@one_blas_thread
 def diagnose(
     model: str | Path | None,
     recordings: Sequence[str | Path | Recording],

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 
 from ..effects import AbstractEffect
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
 
 _SLICE = 1 << 16
 """Numbers whitened at a time: half a megabyte."""
+
+
+one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+"""Decorates what makes many products: the threads are ours (`parallel`), BLAS's own would wait for each other."""
 
 
 def parallel(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
