@@ -87,6 +87,37 @@ def ours(options: dict) -> dict:
     return {"first": first, "again": again, "curve": curve, "peak": _peak()}
 
 
+def constrained(options: dict) -> dict:
+    """The same under constraints of a user's own: what kind, how many margins, starts within 1 % of the best."""
+    import jax.numpy as jnp
+
+    from jaxpanda import session
+    from jaxpanda.feasible import com_in_cylinder, mass_in_ellipsoid, solve
+
+    session.start()
+    session.spread_over_cores()
+    kinds = {
+        "one link heavier than the next": [lambda links: links.mass[1] - links.mass[2]],
+        "two centres of mass outside spheres, not convex": [
+            lambda links: jnp.sum(links.com[1] ** 2) - 0.05**2,
+            lambda links: jnp.sum(links.com[3] ** 2) - 0.1**2,
+        ],
+        "every link's mass in an ellipsoid": [mass_in_ellipsoid(i, [0, 0, 0], [0.3] * 3) for i in range(7)],
+        "every centre of mass in a cylinder, 21 margins": [
+            com_in_cylinder(i, [0, 0, -0.15], [0, 0, 0.15], 0.09) for i in range(7)
+        ],
+    }
+    results = {}
+    for name, constraints in kinds.items():
+        runs = []
+        for seed in range(options["repeats"] + 1):
+            found = solve(*_problem(), constraints=constraints, starts=options["starts"], seed=seed)
+            fine = (found.violation == 0) & (found.objective <= GOOD * found.objective[found.best])
+            runs.append({"starts": options["starts"], "good": int(fine.sum()), "run": found.run_seconds})
+        results[name] = runs[1:]
+    return results
+
+
 def ours_on_gpus(options: dict) -> dict:
     """The same on so many GPUs; the first call compiles and is not counted."""
     import jax
@@ -200,7 +231,8 @@ def make_recordings(options: dict) -> dict:
 
 
 MEASUREMENTS = {
-    one.__name__: one for one in (ours, ours_on_gpus, million, peer, convex, algorithm_1, make_recordings)
+    one.__name__: one
+    for one in (ours, constrained, ours_on_gpus, million, peer, convex, algorithm_1, make_recordings)
 }
 
 
@@ -270,6 +302,12 @@ def on_processors(quick: bool, out: Path) -> dict:
         "... first call, with compilation or its cache", f"{first['wall']:.1f} s for {starts} starts", **first
     )
     table.row("... peak memory", f"{both['peak']:.2f} GiB", peak=both["peak"])
+    for name, runs in child("constrained", two, starts=2048, repeats=repeats).items():
+        rates = rate(runs, "run")
+        share = sum(run["good"] for run in runs) / sum(run["starts"] for run in runs)
+        table.row(
+            f"... under a user's constraints: {name}", f"{spread(rates)}, {share:.1%} end good", rate=rates
+        )
     convex_run = child("convex", one, repeats=10)
     table.row(
         "convex solver (clarabel), once, to the certified optimum",

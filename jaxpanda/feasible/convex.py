@@ -1,10 +1,11 @@
-r"""Least squares under bounds alone: a problem that is convex, and starts that leave when they are done.
+r"""Least squares over links that could be built: nearly convex, and starts that leave when they are done.
 
 **Coordinates.** A link's pseudo-inertia $J$ holds $m$, $mc$ and the second moment about a point, in which $\phi$
 is linear; $J \succ 0$ is positive mass, positive inertia and the triangle inequality at once, and boxes on $m$,
 $c$ ($m\,c_{lo} \le mc \le m\,c_{hi}$), the total mass and $\theta$ are linear. So there is no valley to crawl
 along, and each start's distance from the optimum is known. Only boxes on inertias about the centre of mass are
-not convex; they are wide, as a rule.
+not convex; they are wide, as a rule. The user's own constraints may be anything (`interior`'s augmented
+Lagrangian, as for those boxes).
 
 **Work.** A step (`interior`) costs one Cholesky factor of all unknowns and four triangular solves a start; the
 links' 4x4 matrices are handled entry by entry, the starts contiguous (`small`). A start that is done leaves
@@ -49,6 +50,7 @@ _BOX_INSET = 1e-9  # [kg], [m]: m c / m need not give c to the last bit
 _LEAST_MASS = 1e-3  # [kg]: a link without mass is no body, and MuJoCo refuses it
 _SEGMENT = 3  # steps between two choices of who goes on
 _ROOM = 2  # for given starts: one program serves with them and without
+_SAMPLES = 16  # random starts that say in what unit to measure a constraint
 _INWARDS = 0.02  # how far random starts keep from their boxes, as a share of the way to the middle
 
 _ROW, _COLUMN = np.tril_indices(3)
@@ -60,6 +62,7 @@ def scaled_problem(
     bounds: Bounds,
     extra_lower: Float[np.ndarray, " extra"] | None,
     extra_upper: Float[np.ndarray, " extra"] | None,
+    constraints: tuple[Constraint, ...] = (),
 ) -> Problem:
     """Check the input and scale it; only where `suits`."""
     dof = bounds.dof
@@ -91,7 +94,7 @@ def scaled_problem(
     size = unit[:, 0] * unit[:, 1] ** 2
     missed_in = inertia_unit(bounds, A / sigma)
     A_scaled, b_scaled = (jnp.asarray(part) for part in _compressed(scaled / sigma, b / sigma))
-    return Problem(
+    problem = Problem(
         A=A_scaled,
         b=b_scaled,
         Q=2 * A_scaled.T @ A_scaled,
@@ -106,13 +109,33 @@ def scaled_problem(
         mass_box=jnp.asarray(mass / unit[:, :1]),
         com_box=jnp.asarray((com - centre[..., None]) / unit[:, 1:, None]),
         total_box=jnp.asarray(np.array([-np.inf, np.inf]) if total is None else total),
-        limits=limits_of(bounds, ()),
+        limits=limits_of(bounds, constraints),
         inertia_box=jnp.asarray(inertia_box / missed_in[:, None, None]),
         inset=jnp.asarray(inertia_inset(bounds) / missed_in[:, None])[..., None, None],
         inertia_unit=jnp.asarray(size / missed_in),
+        user_unit=jnp.zeros(0),
         dof=dof,
         boxed=bool(np.any(np.isfinite(inertia_box))),
     )
+    return (
+        eqx.tree_at(lambda problem: problem.user_unit, problem, _user_unit(problem))
+        if constraints
+        else problem
+    )
+
+
+def _user_unit(problem: Problem) -> Float[Array, " user"]:
+    """The longest gradient of each margin among a few random starts, or one where there is none.
+
+    Less where the objective bends more along it: a heavier constraint, that its pressure is soon found.
+    """
+    slopes = jax.jit(jax.vmap(jax.jacrev(lambda u: interior.user_margins(problem, u))))
+    J = slopes(starting_points(problem, _SAMPLES, 0))
+    lengths = jnp.linalg.norm(J, axis=-1)
+    along = J / jnp.where(lengths > 0, lengths, 1.0)[..., None]
+    bends = jnp.sum(along * (along @ problem.Q), -1)
+    units = jnp.max(lengths / jnp.sqrt(jnp.maximum(1.0, bends)), 0)
+    return jnp.where((units > 0) & jnp.isfinite(units), units, 1.0)
 
 
 def _compressed(
@@ -156,15 +179,11 @@ def _of_entries(
     return np.einsum("rli,lij->rlj", A[:, : 10 * dof].reshape(-1, dof, 10), to_phi).reshape(len(A), -1)
 
 
-def suits(
-    bounds: Bounds,
-    constraints: tuple[Constraint, ...],
-    extra: Float[np.ndarray, "extra 2"],
-) -> bool:
-    """Whether there are no constraints beside the bounds and every box has an inside."""
+def suits(bounds: Bounds, extra: Float[np.ndarray, "extra 2"]) -> bool:
+    """Whether every box has an inside."""
     mass = _masses(bounds)
     boxes = [mass, bounds.com.reshape(-1, 2), extra]
-    if constraints or any(np.any(box[:, 1] - box[:, 0] <= 1e3 * _BOX_INSET) for box in boxes):
+    if any(np.any(box[:, 1] - box[:, 0] <= 1e3 * _BOX_INSET) for box in boxes):
         return False
     return bounds.total_mass is None or _total_mass(bounds, _inset(mass)) is not None
 

@@ -3,7 +3,7 @@ r"""Interior-point steps of many starts at once: arrays with the starts ("lanes"
 $$\min_u\ \lVert Au - b\rVert^2 + P(u) \quad\text{subject to}\quad S_l(u) \succ 0,\quad s(u) = Gu + d > 0$$
 
 $S_l$ is link $l$'s pseudo-inertia (linear in $u$), $G$ holds the boxes and the total mass, $P$ the augmented
-Lagrangian of what is not linear in $u$: boxes on inertias about the centre of mass.
+Lagrangian of what is not linear in $u$: boxes on inertias about the centre of mass, and the user's constraints.
 
 **Path.** Primal and dual, $S Z = \mu 1$ and $s z = \mu$, with
 
@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from . import definite, small
+from .constraints import Links
 from .outcome import XYZ_COLUMN, XYZ_ROW, Limits
 
 # Where m, h and Sigma stand among the ten entries of a link's scaled pseudo-inertia, `small.PAIRS`.
@@ -40,10 +41,11 @@ PER_LINK = 8
 _TO_BOUNDARY = 0.95
 _LEAST_DAMPING, _SLIGHT_DAMPING = 1e-12, 1e-3
 _NEARNESS = 150.0  # kappa: how much an end resembles its start, where the optimum leaves that open
-_WEIGHT = 3.0  # of the boxes on inertias, at first; in their units
+_WEIGHT = 3.0  # of what is not linear, at first; in its units
+_INSET = 1e-6  # how far inside the user's constraints to aim; in their units
 _MOST_WEIGHT = 1e6  # as a multiple of the first
 _SHORTER = (1.0, 0.5, 0.2, 0.05)
-_PATIENCE = 4  # steps between two updates of the multipliers
+_PATIENCE = 8  # steps between two updates of the multipliers
 
 
 class Problem(eqx.Module):
@@ -73,6 +75,8 @@ class Problem(eqx.Module):
     """How far inside it to aim."""
     inertia_unit: Float[Array, " dof"]
     """From the unit of S to that unit."""
+    user_unit: Float[Array, " user"]
+    """Of the margins of `limits.constraints`: how much a step of one in u changes them."""
     mass_box: Float[Array, "dof 2"]
     """Scaled, as G holds them; for the starts."""
     com_box: Float[Array, "dof 3 2"]
@@ -82,6 +86,19 @@ class Problem(eqx.Module):
     dof: int = eqx.field(static=True)
     boxed: bool = eqx.field(static=True)
     """Whether any inertia is bounded by more than the triangle inequality."""
+
+    @property
+    def bent(self) -> bool:
+        """Whether anything is not linear in u."""
+        return self.boxed or bool(self.limits.constraints)
+
+
+class Margins(eqx.Module):
+    """Of what is not linear in u; or its multipliers, or pressures ("hinges")."""
+
+    boxes: Float[Array, "dof 6 sides lanes"]
+    """On inertias, in `Problem.inertia_unit`'s unit; no sides where there are none."""
+    user: Float[Array, "user lanes"]
 
 
 class State(eqx.Module):
@@ -94,8 +111,7 @@ class State(eqx.Module):
     """The barrier's gradient at the start, negative."""
     pulled: Float[Array, " lanes"]
     """What it is weighed with at present: the path's mu, on the path."""
-    multipliers: Float[Array, "dof 6 sides lanes"]
-    """Of the boxes on inertias; no sides where there are none."""
+    multipliers: Margins
     weight: Float[Array, " lanes"]
     missed: Float[Array, " lanes"]
     """Largest violation of the constraints that are not linear, at the last update of their multipliers."""
@@ -131,34 +147,62 @@ def _inertia_entries(link: Float[Array, "dof 10 lanes"]) -> Float[Array, "dof 6 
     )
 
 
-def _margins(problem: Problem, u: Float[Array, "columns lanes"]) -> Float[Array, "dof 6 sides lanes"]:
-    """Margins of the boxes on inertias, in `Problem.inertia_unit`'s unit."""
-    if not problem.boxed:
-        return jnp.zeros((problem.dof, 6, 0, u.shape[1]), u.dtype)
-    six = _inertia_entries(_of_links(problem, u)) * problem.inertia_unit[:, None, None]
-    box = problem.inertia_box[..., None]
-    return jnp.stack([six - box[:, :, 0], box[:, :, 1] - six], 2)
+def user_margins(problem: Problem, u: Float[Array, " columns"]) -> Float[Array, " user"]:
+    """Of one start, in their own units."""
+    phi = jnp.einsum("lpq,lq->lp", problem.to_phi, u[: 10 * problem.dof].reshape(problem.dof, 10))
+    links = Links.from_phi(phi)
+    return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(c(links)) for c in problem.limits.constraints)])
+
+
+def _margins(problem: Problem, u: Float[Array, "columns lanes"]) -> Margins:
+    boxes = jnp.zeros((problem.dof, 6, 0, u.shape[1]), u.dtype)
+    if problem.boxed:
+        six = _inertia_entries(_of_links(problem, u)) * problem.inertia_unit[:, None, None]
+        box = problem.inertia_box[..., None]
+        boxes = jnp.stack([six - box[:, :, 0], box[:, :, 1] - six], 2)
+    user = jax.vmap(lambda u: user_margins(problem, u) / problem.user_unit, -1, -1)(u)
+    return Margins(boxes, user)
+
+
+def _inset(problem: Problem) -> Margins:
+    """How far inside to aim."""
+    return Margins(problem.inset, jnp.full((len(problem.user_unit), 1), _INSET))
+
+
+def _sums(*trees: Margins, of) -> Float[Array, " lanes"]:
+    """Over all margins of a lane, what `of` makes of them."""
+    parts = jax.tree.map(of, *trees)
+    return jnp.sum(parts.boxes, (0, 1, 2)) + jnp.sum(parts.user, 0)
+
+
+def _pressed(hinges: Margins) -> Bool[Array, " lanes"]:
+    return _sums(hinges, of=lambda hinge: hinge) > 0
 
 
 class _Value(NamedTuple):
     objective: Float[Array, " lanes"]
     """Sum of squares and augmented Lagrangian."""
     residual: Float[Array, "rows lanes"]
-    margins: Float[Array, "dof 6 sides lanes"]
-    hinges: Float[Array, "dof 6 sides lanes"]
-    """Pressure of each box: not negative, zero where it is amply satisfied."""
+    margins: Margins
+    hinges: Margins
+    """Pressures: not negative, zero where a margin is ample."""
 
 
 def _evaluate(problem: Problem, u: Float[Array, "columns lanes"], state: State) -> _Value:
     residual = problem.A @ u - problem.b[:, None]
     margins = _margins(problem, u)
-    hinges = jnp.maximum(0.0, state.multipliers + state.weight * (problem.inset - margins))
-    penalty = jnp.sum(hinges**2, (0, 1, 2)) / (2 * state.weight)
+    hinges = jax.tree.map(
+        lambda y, inset, margin: jnp.maximum(0.0, y + state.weight * (inset - margin)),
+        state.multipliers,
+        _inset(problem),
+        margins,
+    )
+    penalty = _sums(hinges, of=jnp.square) / (2 * state.weight)
     return _Value(jnp.sum(residual**2, 0) + penalty, residual, margins, hinges)
 
 
 def _model(problem: Problem, state: State, value: _Value):
-    """Gradient of the objective; its Hessian beyond Q, as blocks of the links."""
+    """Gradient of the objective; its Hessian beyond Q, as blocks of the links and as rows whose squares it is."""
     n = 10 * problem.dof
     gradient = 2 * problem.A.T @ value.residual
     blocks = jnp.zeros(())
@@ -170,14 +214,21 @@ def _model(problem: Problem, state: State, value: _Value):
             * problem.inertia_unit[:, None, None, None]
         )  # (dof, 6, 10, lanes)
         E = jax.lax.optimization_barrier(E)
-        pressure = value.hinges[:, :, 1] - value.hinges[:, :, 0]
+        hinges = value.hinges.boxes
+        pressure = hinges[:, :, 1] - hinges[:, :, 0]
         gradient = gradient.at[:n].add(jnp.sum(E * pressure[:, :, None], 1).reshape(n, -1))
-        pressed = state.weight * jnp.sum(value.hinges > 0, 2)
+        pressed = state.weight * jnp.sum(hinges > 0, 2)
         blocks = jnp.sum(E[:, :, :, None] * (E * pressed[:, :, None])[:, :, None], 1)
-    return gradient, blocks
+    rows = jnp.zeros((0, *state.u.shape))
+    if problem.limits.constraints:
+        J = jax.vmap(jax.jacrev(lambda u: user_margins(problem, u) / problem.user_unit), -1, -1)(state.u)
+        hinges = value.hinges.user
+        gradient = gradient - jnp.sum(J * hinges[:, None], 0)
+        rows = J * jnp.sqrt(jnp.where(hinges > 0, state.weight, 0.0))[:, None]
+    return gradient, blocks, rows
 
 
-def _assemble(problem: Problem, blocks, ratio, damping) -> Float[Array, "lanes columns columns"]:
+def _assemble(problem: Problem, blocks, rows, ratio, damping) -> Float[Array, "lanes columns columns"]:
     """The step's matrix: lanes first, as the library's Cholesky wants them."""
     n, dof, first = 10 * problem.dof, problem.dof, PER_LINK * problem.dof
     lanes, columns = ratio.shape[1], len(problem.Q)
@@ -198,6 +249,8 @@ def _assemble(problem: Problem, blocks, ratio, damping) -> Float[Array, "lanes c
         + ratio[first][:, None, None] * (low[:, None] * low)
         + ratio[first + 1][:, None, None] * (high[:, None] * high)
     )
+    if len(rows):
+        H = H + jnp.einsum("kpb,kqb->bpq", rows, rows)
     return H + diagonal[:, :, None] * jnp.eye(columns)
 
 
@@ -220,7 +273,7 @@ def initialise(
         z=1 / s,
         pull=pull,
         pulled=jnp.ones(lanes),
-        multipliers=jnp.zeros_like(margins),
+        multipliers=jax.tree.map(jnp.zeros_like, margins),
         weight=jnp.full(lanes, _WEIGHT),
         missed=jnp.full(lanes, jnp.inf),
         waited=fresh,
@@ -248,15 +301,15 @@ def step(problem: Problem, state: State, most: int) -> State:
     gap = small.inner(S, state.Z) + jnp.sum(s * state.z, 0)
     mu = gap / order
     value = _evaluate(problem, state.u, state)
-    gradient, blocks = _model(problem, state, value)
+    gradient, blocks, rows = _model(problem, state, value)
     away = state.pull + _NEARNESS * (state.u - state.start)  # what the target's mu is multiplied with
     unbalanced = gradient - G.T @ state.z + state.pulled * away
     unbalanced = unbalanced.at[:n].add(-small.adjoint(state.Z).reshape(n, -1))
-    pressed = jnp.any(value.hinges > 0, (0, 1, 2))
+    pressed = _pressed(value.hinges)
     blocks = blocks + small.curvature(S_inverse, state.Z)
     # The next target is not known yet; a tenth of mu is about right.
     nearness = 0.1 * _NEARNESS * mu
-    H = _assemble(problem, blocks, state.z / s, state.damping + nearness)
+    H = _assemble(problem, blocks, rows, state.z / s, state.damping + nearness)
     factor = definite.factor(H)
     solve = lambda rhs: definite.solve(factor, rhs.T).T
     nothing_left = 1e-14 * jnp.sum(problem.b**2)
@@ -288,11 +341,11 @@ def step(problem: Problem, state: State, most: int) -> State:
     du, _, dZ, _, dz, alpha, target, within_reach = jax.lax.fori_loop(0, 2, direction, nothing)
     alpha = jnp.where(alpha < 1, _TO_BOUNDARY * alpha, 1.0)
 
-    # Where a box bends, the whole step may lead astray: the longest of a few that does not.
+    # Where a constraint bends, the whole step may lead astray: the longest of a few that does not.
     def objective(share: float) -> Float[Array, " lanes"]:
         return _evaluate(problem, state.u + share * alpha * du, state).objective
 
-    if problem.boxed:
+    if problem.bent:
         fine = jnp.stack([objective(share) for share in _SHORTER]) <= value.objective + gap
         alpha = alpha * jnp.asarray(_SHORTER)[jnp.argmax(fine, 0)]
     u = state.u + alpha * du
@@ -305,14 +358,15 @@ def step(problem: Problem, state: State, most: int) -> State:
     u = pick(u, state.u)
     left = small.inner(matrices(problem, u), Z) + jnp.sum((G @ u + problem.d[:, None]) * z, 0)
 
-    # Boxes on inertias: whether they hold, and whether their multipliers have settled.
-    missed = -jnp.min(value.margins, (0, 1, 2), initial=0.0)
-    slack = value.hinges * jnp.abs(value.margins - problem.inset)
-    unsettled = jnp.sum(slack, (0, 1, 2), where=value.hinges > 0)
+    # What is not linear: whether it holds, and whether its multipliers have settled.
+    least = jnp.min(value.margins.boxes, (0, 1, 2), initial=0.0)
+    missed = -jnp.minimum(least, jnp.min(value.margins.user, 0, initial=0.0))
+    slack = lambda hinge, margin, inset: jnp.where(hinge > 0, hinge * jnp.abs(margin - inset), 0.0)
+    unsettled = _sums(value.hinges, value.margins, _inset(problem), of=slack)
     solved = state.tolerance * value.objective
     nothing_left = value.objective <= nothing_left
     # What is unbalanced after the step, where the objective is quadratic; elsewhere it is looked at again.
-    pressed = pressed | jnp.any(value.hinges > 0, (0, 1, 2))
+    pressed = pressed | _pressed(value.hinges)
     taken = jnp.where(pressed | ~better, 0.0, alpha)
     unbalanced = (1 - taken) * unbalanced + taken * (_NEARNESS * target - nearness - state.damping) * du
     unbalanced = jnp.max(jnp.abs(unbalanced), 0)
@@ -324,9 +378,9 @@ def step(problem: Problem, state: State, most: int) -> State:
     on_path = (close & (unbalanced <= 0.01 * jnp.sqrt(solved))) | nothing_left
     done = state.done | (active & on_path & (missed <= 0) & ((unsettled <= solved) | nothing_left))
     update = active & ((state.waited >= _PATIENCE) | on_path)
-    stuck = missed > 0.25 * state.missed
-    factor = jnp.where(stuck, 10.0, jnp.where(state.weight < 100 * _WEIGHT, 3.0, 1.0))
-    heavier = jnp.minimum(factor * state.weight, _MOST_WEIGHT * _WEIGHT)
+    # Heavier only where the objective has been solved: a heavy constraint that bends leaves short steps alone.
+    stuck = on_path & (missed > 0.25 * state.missed)
+    heavier = jnp.minimum(jnp.where(stuck, 10.0, 1.0) * state.weight, _MOST_WEIGHT * _WEIGHT)
     return State(
         u=u,
         start=state.start,
@@ -335,7 +389,9 @@ def step(problem: Problem, state: State, most: int) -> State:
         z=z,
         pull=state.pull,
         pulled=pulled,
-        multipliers=jnp.where(update, value.hinges, state.multipliers),
+        multipliers=jax.tree.map(
+            lambda new, old: jnp.where(update, new, old), value.hinges, state.multipliers
+        ),
         weight=jnp.where(update, heavier, state.weight),
         missed=jnp.where(update, missed, state.missed),
         waited=jnp.where(update, 0, state.waited + 1),

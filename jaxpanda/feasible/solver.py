@@ -3,13 +3,15 @@ r"""Many-start least squares over physically feasible links.
 $$\min_{x}\ \lVert A\,(\phi, \theta) - b\rVert^2 \quad\text{over links that could be built}$$
 
 Under bounds alone the problem is convex in the right coordinates, but for boxes on inertias: an interior-point
-method carries every start to the optimum (`convex`). Under further constraints, which need not be convex, or
-where a box is a point, Newton steps are taken under an augmented Lagrangian (`newton`).
+method carries every start to the optimum (`convex`), and under further constraints, which need not be convex, to
+one as a rule. Where few starts get there, or a box is a point, Newton steps in other coordinates are taken
+(`newton`), ten times as long.
 """
 
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -24,7 +26,20 @@ from .outcome import extra_box
 
 STARTS = 2048
 """Default number of random starts."""
+_TRIED, _ENOUGH = (
+    64,
+    0.5,
+)  # starts that tell whether the path suits the user's constraints: so many must converge
 _BLOCK = 4096  # starts whose objective is evaluated at once
+
+
+class _Way(NamedTuple):
+    """How to solve a problem: the chunk's program, where starts come from, its static options, its size."""
+
+    solve_starts: schedule.Chunk
+    origin: Any
+    steps: tuple[int, int]
+    chunk: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,31 +119,37 @@ def solve(
     constraints = tuple(constraints)
     extra = np.stack(extra_box(A, b, bounds, extra_lower, extra_upper), -1)
     device = (jax.local_devices() if devices is None else devices)[0]
-    if convex.suits(bounds, constraints, extra):
-        problem = convex.scaled_problem(A, b, bounds, extra_lower, extra_upper)
-        origin = convex.origin_of(problem, seed, initial)
-        kind = "cpu" if device.platform == "cpu" else "gpu"
-        solve_starts, steps = convex.solve_starts, (rounds * iterations, convex.LANES[kind])
-        chunk = convex.CHUNK[kind] if chunk is None else chunk
-    else:
-        problem = newton.scaled_problem(A, b, bounds, constraints, extra_lower, extra_upper)
+    on_cpu = device.platform == "cpu"
+    further = (extra_lower, extra_upper)
+
+    def along_the_path() -> _Way:
+        problem = convex.scaled_problem(A, b, bounds, *further, constraints)
+        kind = "cpu" if on_cpu else "gpu"
+        steps = rounds * iterations, convex.LANES[kind]
+        return _Way(convex.solve_starts, convex.origin_of(problem, seed, initial), steps, convex.CHUNK[kind])
+
+    def by_newton() -> _Way:
+        problem = newton.scaled_problem(A, b, bounds, constraints, *further)
         origin = newton.origin_of(problem, bounds, seed, initial)
-        solve_starts, steps = newton.solve_starts, (rounds, iterations)
-        chunk = min(newton.CHUNK if chunk is None else chunk, starts)
+        return _Way(newton.solve_starts, origin, (rounds, iterations), min(newton.CHUNK, starts))
+
+    def go(way: _Way, starts: int, **options: Any) -> tuple[Any, float, float]:
+        size = way.chunk if chunk is None else chunk
+        return schedule.run(
+            way.solve_starts, way.origin, way.steps, starts=starts, chunk=size, devices=devices, **options
+        )
+
+    way = along_the_path() if convex.suits(bounds, extra) else by_newton()
+    if constraints and way.solve_starts is convex.solve_starts:
+        tried = go(way, min(starts, _TRIED))[0]
+        if np.mean(tried.converged) < _ENOUGH:
+            way = by_newton()
     kept = None
     if checkpoint is not None:
-        further = (extra_lower, extra_upper, initial)
-        kept = Checkpoint(checkpoint, identity(A, b, bounds, constraints, further, seed, steps))
-    found, compile_seconds, run_seconds = schedule.run(
-        solve_starts,
-        origin,
-        steps,
-        starts=starts,
-        chunk=chunk,
-        devices=devices,
-        checkpoint=kept,
-        progress=progress,
-    )
+        kept = Checkpoint(
+            checkpoint, identity(A, b, bounds, constraints, (*further, initial), seed, way.steps)
+        )
+    found, compile_seconds, run_seconds = go(way, starts, checkpoint=kept, progress=progress)
     return Solutions(
         phi=found.phi,
         extra=found.extra,
