@@ -17,7 +17,7 @@ from ..rollout import compare
 from . import page
 from .diagnosis import Diagnosis, diagnose, predict
 from .knowledge import Knowledge
-from .scan import one_blas_thread
+from .scan import on_host
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Prediction:
         return [f"{self.rows} rows of torque in {self.path}."]
 
 
-@one_blas_thread
+@on_host
 def diagnose_files(
     out: Path,
     model: Path | None,

@@ -1,6 +1,7 @@
 """From accepted terms to findings: merged, weighed against their rivals, and said in words."""
 
 import dataclasses
+import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -23,7 +24,10 @@ LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05
 many times the noise's own, in a joint whose residual is at least this share of the largest."""
 DOUBT, CROWD = 6.0, 0.6
 """How probability falls with the share that is left in a finding's joints, $e^{-6 s}$, and with every effect
-beyond two that the model needed: who needs many laws has not met the right one."""
+beyond two in its `crowd`: who needs many laws has not met the right one."""
+MEANT, AS_CLEAR = 0.05, 0.1
+"""Share of a term's torque from which it counts among the laws of a joint; share of a term's evidence from which
+another's is about as clear."""
 MOST_ALIKE = 2
 """Terms of one effect at one place, beyond which it is not the right one: three ripples make any shape."""
 STICKS = 1.5e-3
@@ -77,9 +81,24 @@ def findings(problem: Problem, state: State) -> list[Finding]:
     before, after = leftover(state)
     left = np.clip(after / np.maximum(before, 1e-9), 0, 1) * (after > LEFT_CLEAR)
     names = titles(state.terms)
-    doubt = CROWD ** max(0, len(set(names)) - 2) * np.exp(-DOUBT * shares(state) @ left)
+    doubt = CROWD ** np.maximum(0.0, crowd(state, names, [r[0] for r in rivals]) - 2)
+    doubt = doubt * np.exp(-DOUBT * shares(state) @ left)
     out = [_finding(problem, state, places, names[places[0]], rivals, doubt) for places in groups]
     return sorted(out, key=lambda f: -f.evidence)
+
+
+def crowd(state: State, names: Sequence[str], evidence: Sequence[float]) -> Float[np.ndarray, " terms"]:
+    """How many effects stand beside each term, itself included: in its joints, or about as clear anywhere."""
+    where = shares(state)
+    found = np.zeros(len(names))
+    for i, joint in itertools.product(range(len(names)), range(where.shape[1])):
+        beside = {
+            name
+            for name, share, clear in zip(names, where[:, joint], evidence, strict=True)
+            if share > MEANT or clear >= AS_CLEAR * evidence[i]
+        }
+        found[i] += where[i, joint] * len(beside)
+    return found
 
 
 def partly(state: State) -> bool:

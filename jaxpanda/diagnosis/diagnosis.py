@@ -26,7 +26,7 @@ from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
-from .scan import one_blas_thread
+from .scan import on_host
 from .search import State, transferable
 from .traces import Trace, prepare
 
@@ -153,7 +153,7 @@ class Diagnosis:
             self.next_motion.save(folder / NEXT_MOTION)
 
 
-@one_blas_thread
+@on_host
 def diagnose(
     model: str | Path | None,
     recordings: Sequence[str | Path | Recording],

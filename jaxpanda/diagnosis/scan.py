@@ -7,12 +7,14 @@ as the noise of their joint does; then a step costs small matrices only.
 """
 
 import dataclasses
+import functools
 import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
+import jax
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
@@ -26,12 +28,29 @@ from .traces import Trace
 if TYPE_CHECKING:
     from .problem import Problem, Term
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
 _SLICE = 1 << 16
 """Numbers whitened at a time: half a megabyte."""
 
 
-one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
-"""Decorates what makes many products: the threads are ours (`parallel`), BLAS's own would wait for each other."""
+def on_host(work: Callable[P, R]) -> Callable[P, R]:
+    """Decorates what makes many small products: on the processor's cores, with no threads but ours (`parallel`).
+
+    BLAS's own threads would wait for each other and for ours; a GPU, for the next of a thousand small programs.
+    """
+
+    @functools.wraps(work)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            processor = jax.local_devices(backend="cpu")[0]
+        except RuntimeError:  # JAX_PLATFORMS leaves it out
+            processor = None
+        with threadpool_limits(limits=1, user_api="blas"), jax.default_device(processor):
+            return work(*args, **kwargs)
+
+    return alone
 
 
 def parallel(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
