@@ -396,7 +396,7 @@ def _published_table() -> str:
 def on_gpus(quick: bool) -> dict:
     """Retrieval on the GPUs of this machine."""
     table = Table()
-    starts = 131072 if quick else 524288
+    starts = 131072 if quick else 1 << 20
     single = None
     for count in (1, 2, 4):
         found = child("ours_on_gpus", None, starts=starts, count=count, repeats=2 if quick else 3)

@@ -28,6 +28,19 @@ beyond two in its `crowd`: who needs many laws has not met the right one."""
 MEANT, AS_CLEAR = 0.05, 0.1
 """Share of a term's torque from which it counts among the laws of a joint; share of a term's evidence from which
 another's is about as clear."""
+HOLDS = {
+    "payload_change": ("payload",),
+    "inertial_parameters": ("payload",),
+    "torque_drift": ("torque_offset",),
+    "joint_spring": ("torque_offset",),
+    **dict.fromkeys(
+        ("asymmetric_friction", "stribeck_friction", "load_dependent_friction", "friction_drift"),
+        ("viscous_friction", "coulomb_friction"),
+    ),
+}
+"""Effects of which others are special cases; whoever sees as much of either takes the special one."""
+SPECIAL = 2.0
+"""By how much, as a logarithm: what richer laws pay for in evidence, the temperature takes from them."""
 MOST_ALIKE = 2
 """Terms of one effect at one place, beyond which it is not the right one: three ripples make any shape."""
 STICKS = 1.5e-3
@@ -156,14 +169,19 @@ def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, fl
     term = state.terms[i]
     evidence = state.design.log_evidence - without(state, i).log_evidence
     by_name: dict[str, float] = {}
+    where: dict[str, tuple[int, ...]] = {}
     for proposal in instead(problem, state, i):
         name = called(proposal.effect)
-        by_name[name] = max(by_name.get(name, -np.inf), proposal.evidence)
+        if proposal.evidence > by_name.get(name, -np.inf):
+            by_name[name], where[name] = proposal.evidence, proposal.effect.joints
     if term.effect.name == "unknown":  # it has met its margin already
         by_name["unknown"] = max(by_name.get("unknown", -np.inf), evidence)
     names = list(by_name)
     weights = np.array([by_name[n] for n in names] + [0.5 * ACCEPT])
     weights = weights / (TEMPERATURE + RELATIVE_TEMPERATURE * max(float(weights.max()), 0.0))
+    for k, name in enumerate(names):
+        if any(where.get(simple) == where.get(name) for simple in HOLDS.get(name, ())):
+            weights[k] -= SPECIAL
     posterior = np.exp(weights - scipy.special.logsumexp(weights))
     probability = dict(zip(names, posterior.tolist(), strict=False))
     return evidence, probability, probability.get(called(term.effect), 0.0)

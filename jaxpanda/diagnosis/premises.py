@@ -8,7 +8,8 @@ Two premises come from the user: how well the model's numbers are known, and rec
 - Numbers may be known worse than the user says: a model that was identified without friction, or on another
   arm, is off by far more than the noise of an identification. If the recordings are likelier by `CONTRADICTION`
   under a wider word of `knowledge`, beside all effects found, the search is repeated with that word. So it is if
-  that word alone does better than the inertial parameters of several links that were found to be wrong.
+  that word alone does better than the inertial parameters of several links that were found to be wrong, or of
+  one by less than the noise.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from jaxtyping import Float
 from ..effects.load import InertialParameters, Payload
 from . import knowledge as knowledge_
 from .problem import Problem, Term, posed
-from .search import State, search
+from .search import State, places, search
 from .traces import Trace
 
 CONTRADICTION, SHARE = 100.0, 0.03
@@ -94,9 +95,17 @@ def _contradicted(premises: Premises, state: State) -> knowledge_.Knowledge | No
     gained = other.design(state.terms, state.noise).log_evidence - state.design.log_evidence
     if gained > max(CONTRADICTION, SHARE * explained):
         return word
-    # Several bodies that are not what the model says are one model whose numbers are not known.
+    # Several bodies that are not what the model says are one model whose numbers are not known; so is one whose
+    # difference drowns in the noise.
     bodies = [t for t in state.terms if isinstance(t.effect, InertialParameters | Payload)]
-    if len({t.key for t in bodies}) < _SEVERAL:
+    if not bodies or (len({t.key for t in bodies}) < _SEVERAL and not _faint(state, bodies[0])):
         return None
     others = tuple(t for t in state.terms if all(t is not b for b in bodies))
     return word if other.design(others, state.noise).log_evidence > state.design.log_evidence else None
+
+
+def _faint(state: State, term: Term) -> bool:
+    """Whether a term's torque is below the noise's deviation at every joint."""
+    at = places(state)[next(i for i, t in enumerate(state.terms) if t is term)]
+    torque = np.concatenate([columns @ state.design.x[at] for columns in term.columns])
+    return bool(np.all(np.sqrt(np.mean(torque**2, 0)) < state.noise.std))
