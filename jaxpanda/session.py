@@ -31,7 +31,7 @@ def start() -> None:
     folder = os.environ.get("JAXPANDA_CACHE", str(Path.home() / ".cache" / "jaxpanda"))
     if folder and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", folder)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def spread_over_cores() -> None:

@@ -6,6 +6,7 @@ time, which never leaves the cache, and multiplied with everything in the model 
 as the noise of their joint does; then a step costs small matrices only.
 """
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -43,11 +44,11 @@ def on_host(work: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(work)
     def alone(*args: P.args, **kwargs: P.kwargs) -> R:
-        try:
-            processor = jax.local_devices(backend="cpu")[0]
-        except RuntimeError:  # JAX_PLATFORMS leaves it out
-            processor = None
-        with threadpool_limits(limits=1, user_api="blas"), jax.default_device(processor):
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(threadpool_limits(limits=1, user_api="blas"))
+            if jax.default_backend() != "cpu":
+                with contextlib.suppress(RuntimeError):  # JAX_PLATFORMS leaves the processor out
+                    stack.enter_context(jax.default_device(jax.local_devices(backend="cpu")[0]))
             return work(*args, **kwargs)
 
     return alone
