@@ -93,16 +93,20 @@ def findings(problem: Problem, state: State) -> list[Finding]:
     groups = together(problem, state.terms)
     before, after = leftover(state)
     left = np.clip(after / np.maximum(before, 1e-9), 0, 1) * (after > LEFT_CLEAR)
-    names = titles(state.terms)
-    doubt = CROWD ** np.maximum(0.0, crowd(state, names, [r[0] for r in rivals]) - 2)
-    doubt = doubt * np.exp(-DOUBT * shares(state) @ left)
+    names, where = titles(state.terms), shares(state)
+    doubt = CROWD ** np.maximum(0.0, crowd(where, names, [r[0] for r in rivals]) - 2)
+    doubt = doubt * np.exp(-DOUBT * where @ left)
     out = [_finding(problem, state, places, names[places[0]], rivals, doubt) for places in groups]
     return sorted(out, key=lambda f: -f.evidence)
 
 
-def crowd(state: State, names: Sequence[str], evidence: Sequence[float]) -> Float[np.ndarray, " terms"]:
-    """How many effects stand beside each term, itself included: in its joints, or about as clear anywhere."""
-    where = shares(state)
+def crowd(
+    where: Float[np.ndarray, "terms dof"], names: Sequence[str], evidence: Sequence[float]
+) -> Float[np.ndarray, " terms"]:
+    """How many effects stand beside each term, itself included: in its joints, or about as clear anywhere.
+
+    `where`: each term's shares of torque in the joints.
+    """
     found = np.zeros(len(names))
     for i, joint in itertools.product(range(len(names)), range(where.shape[1])):
         beside = {

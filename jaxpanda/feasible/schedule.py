@@ -94,23 +94,18 @@ def run(
         first += (jax.process_index() if shared else 0) * share * chunk
         return [hands[k % len(mine)].submit(solved, k % len(mine), first + k * chunk) for k in range(share)]
 
-    def outcome_of(first: int) -> list[np.ndarray]:
-        """Where a chunk's rows belong; none of a chunk past the last start."""
-        return [whole[min(first, starts) : min(first + chunk, starts)] for whole in outcome]
-
     def finish(first: int, chunks: list[Future[list[Array]]]) -> None:
         last = min(first + wave, starts)
         if shared:
             fetched = jax.device_get([one.result() for one in chunks])
-            parts = [np.concatenate(part) for part in zip(*fetched, strict=True)]
-            parts = multihost_utils.process_allgather(parts, tiled=True)
-            for whole, part in zip(outcome, parts, strict=True):
-                whole[first:last] = part[: last - first]
+            together = [np.concatenate(part) for part in zip(*fetched, strict=True)]
+            parts = [(first, multihost_utils.process_allgather(together, tiled=True))]
         else:
-            for k, one in enumerate(chunks):
-                here = outcome_of(first + k * chunk)
-                for whole, part in zip(here, one.result(), strict=True):
-                    whole[:] = np.asarray(part)[: len(whole)]
+            parts = ((first + k * chunk, one.result()) for k, one in enumerate(chunks))
+        for at, rows in parts:
+            for whole, part in zip(outcome, rows, strict=True):
+                here = whole[at:last][: len(part)]  # none of a chunk past the last start
+                here[:] = np.asarray(part)[: len(here)]
         if checkpoint is not None and jax.process_index() == 0:
             checkpoint.append(first, tuple(whole[first:last] for whole in outcome))
         if progress is not None:

@@ -26,10 +26,8 @@ from .outcome import extra_box
 
 STARTS = 2048
 """Default number of random starts."""
-_TRIED, _ENOUGH = (
-    64,
-    0.5,
-)  # starts that tell whether the path suits the user's constraints: so many must converge
+_TRIED = 64  # starts that tell whether the path suits the user's constraints
+_ENOUGH = 0.5  # share of them that must converge
 _BLOCK = 4096  # starts whose objective is evaluated at once
 
 
@@ -119,12 +117,11 @@ def solve(
     constraints = tuple(constraints)
     extra = np.stack(extra_box(A, b, bounds, extra_lower, extra_upper), -1)
     device = (jax.local_devices() if devices is None else devices)[0]
-    on_cpu = device.platform == "cpu"
     further = (extra_lower, extra_upper)
 
     def along_the_path() -> _Way:
         problem = convex.scaled_problem(A, b, bounds, *further, constraints)
-        kind = "cpu" if on_cpu else "gpu"
+        kind = "cpu" if device.platform == "cpu" else "gpu"
         steps = rounds * iterations, convex.LANES[kind]
         return _Way(convex.solve_starts, convex.origin_of(problem, seed, initial), steps, convex.CHUNK[kind])
 
