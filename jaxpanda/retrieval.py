@@ -36,6 +36,7 @@ AS_GOOD = 1.01
 """A solution is as good as the best where its objective is within this factor of it."""
 CONCESSION = 5e-4
 """Share of the objective that may be given up to stay near the nominal parameters."""
+_NOTHING = 1e-12  # share of the coefficients' squares that counts as none
 ACTIVE = 1e-5
 """A constraint is active where its margin is below this share of its box (triangle inequality: [kg m²])."""
 _BLOCK = 16384  # starts described at once
@@ -226,7 +227,8 @@ def retrieve(
             f"no start of {starts} satisfies all bounds and constraints (nearest misses by "
             f"{found.violation.min():.2g}); widen them, or give more starts"
         )
-    as_good = feasible & (found.objective <= AS_GOOD * found.objective[found.best])
+    best = found.objective[found.best]
+    as_good = feasible & (found.objective <= max(AS_GOOD * best, _NOTHING * float(b @ b)))
     as_good[found.best] = True
     phi, violation = found.phi[found.best], float(found.violation[found.best])
     nominal = _nominal(arm, table)
@@ -334,7 +336,7 @@ def _towards(
     scale = np.concatenate([mass, *[mass * size] * 3, *[mass * size**2] * 6], 1)
     distance = lambda phi: float(np.sum(((phi - nominal) / scale) ** 2))
     objective = lambda phi: float(np.sum((A @ phi.ravel() - b) ** 2))
-    room = CONCESSION * objective(best) + 1e-12 * float(b @ b)
+    room = CONCESSION * objective(best) + _NOTHING * float(b @ b)
     root = np.sqrt(room / max(distance(best), 1e-300))
     pulled = solve(
         np.concatenate([A, np.diag(root / scale.ravel())]),

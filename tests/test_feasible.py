@@ -1,5 +1,7 @@
 """Bounds, constraints and the many-start solver."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +24,7 @@ from jaxpanda.feasible import (
     when,
 )
 from jaxpanda.feasible.convex import TOLERANCE, scaled_problem, solve_chunk, starting_points
+from jaxpanda.feasible.outcome import XYZ_COLUMN, XYZ_ROW
 from jaxpanda.panda import panda, published
 from jaxpanda.parameters import coefficient_matrix
 
@@ -33,6 +36,13 @@ def boxes(dof: int, total: tuple[float, float] | None = None) -> Bounds:
         inertia=np.tile([[0.0, 1.0]] * 3 + [[-1.0, 1.0]] * 3, (dof, 1, 1)),
         total_mass=None if total is None else np.array(total),
     )
+
+
+def published_problem() -> tuple[np.ndarray, np.ndarray, Bounds]:
+    """The 41 coefficients that the paper calls reliable."""
+    rows = [row for row in published()["coefficients"] if row["reliable"]]
+    A = coefficient_matrix([row["terms"] for row in rows], 7)
+    return A, np.array([row["value"] for row in rows]), Bounds.panda()
 
 
 def least_eigenvalue(phi: np.ndarray) -> float:
@@ -71,6 +81,31 @@ def test_a_reachable_right_hand_side_is_reached_from_most_starts(reachable):
     assert np.mean((found.objective < 1e-10) & (found.violation == 0)) > 0.9
     x = np.concatenate([found.phi.reshape(64, -1), found.extra], 1)
     np.testing.assert_allclose(np.sum((x @ A.T - b) ** 2, 1), found.objective, atol=1e-20)
+
+
+def test_what_links_of_the_panda_have_is_met_by_nearly_all_starts_each_in_its_own_way():
+    """41 coefficients of 70 parameters: the exact solutions are a space of 29 dimensions, boxes allowing."""
+    A, _, bounds = published_problem()
+    b = A @ np.asarray(panda().standard).ravel()
+    found = solve(A, b, bounds, starts=128)
+    met = (found.violation == 0) & (found.objective <= 1e-14 * b @ b)
+    assert np.mean(met) > 0.95
+    np.testing.assert_array_equal(found.converged, met)
+    assert np.median(found.iterations[met]) < 10
+    assert np.linalg.matrix_rank(found.phi[met].reshape(met.sum(), -1) - found.phi[met][0].ravel()) == 29
+    for phi in found.phi[met][:8]:
+        assert all(least_eigenvalue(link) > 0 for link in phi)
+
+
+def test_where_boxes_on_inertias_bind_exact_coefficients_are_met_all_the_same():
+    A, _, bounds = published_problem()
+    truth = panda()
+    boxes = np.asarray(jax.vmap(inertia.to_com)(truth.standard)[2])[:, XYZ_ROW, XYZ_COLUMN]
+    width = 0.3 * np.abs(boxes).max(1, keepdims=True)
+    tight = dataclasses.replace(bounds, inertia=np.stack([boxes - width, boxes + width], -1))
+    b = A @ np.asarray(truth.standard).ravel()
+    found = solve(A, b, tight, starts=64)
+    assert np.mean((found.violation == 0) & (found.objective <= 1e-10 * b @ b)) > 0.8
 
 
 def test_no_violation_means_that_numpy_finds_none_either(reachable):
@@ -138,12 +173,8 @@ def test_constraints_that_the_path_cannot_follow_are_met_by_newton(radius):
 
 def test_most_starts_reach_the_optimum_under_constraints_of_the_users_own():
     """The published coefficients with each centre of mass in a cylinder, some of which bind."""
-    rows = [row for row in published()["coefficients"] if row["reliable"]]
-    A = coefficient_matrix([row["terms"] for row in rows], 7)
     constraints = [com_in_cylinder(i, [0, 0, -0.15], [0, 0, 0.15], 0.09) for i in range(7)]
-    found = solve(
-        A, np.array([row["value"] for row in rows]), Bounds.panda(), constraints=constraints, starts=128
-    )
+    found = solve(*published_problem(), constraints=constraints, starts=128)
     best = found.objective[found.best]
     assert 3.7262e-4 < best < 3.735e-4
     assert np.mean((found.violation == 0) & (found.objective <= 1.01 * best)) > 0.9

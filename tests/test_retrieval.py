@@ -99,6 +99,17 @@ def quick() -> dict:
     return {"starts": 64, "certificate": False, "bounds": Bounds.panda()}
 
 
+def test_where_nothing_is_left_to_gain_the_last_digits_do_not_make_one_solution_better(quick):
+    """Coefficients that links of the Panda have exactly: rounding leaves 1e-16 of them, more or less."""
+    rows = table()["coefficients"]
+    values = coefficient_matrix([row["terms"] for row in rows], 7) @ panda().standard.ravel()
+    exact = {"coefficients": [row | {"value": float(v)} for row, v in zip(rows, values, strict=True)]}
+    links = retrieve(exact, **quick)
+    assert links.as_good > 0.9 * links.starts
+    low, high = links.spread["m2"]
+    assert high - low > 1.0
+
+
 def test_weighing_by_torque_misses_the_sure_coefficients_less(quick):
     rows = table()["coefficients"]
     K = coefficient_matrix([row["terms"] for row in rows], 7)

@@ -9,7 +9,7 @@ Lagrangian, as for those boxes).
 
 **Work.** A step (`interior`) costs one Cholesky factor of all unknowns and four triangular solves a start; the
 links' 4x4 matrices are handled entry by entry, the starts contiguous (`small`). A start that is done leaves
-(`solve_chunk`).
+(`turns`).
 """
 
 import equinox as eqx
@@ -34,6 +34,7 @@ from .outcome import (
     largest_violation,
     limits_of,
 )
+from .turns import in_turns
 
 CHUNK = {"cpu": 256, "gpu": 262144}
 """Starts handed to a device at once, by its platform."""
@@ -48,7 +49,6 @@ _PRECISION = 1e-5
 
 _BOX_INSET = 1e-9  # [kg], [m]: m c / m need not give c to the last bit
 _LEAST_MASS = 1e-3  # [kg]: a link without mass is no body, and MuJoCo refuses it
-_SEGMENT = 3  # steps between two choices of who goes on
 _ROOM = 2  # for given starts: one program serves with them and without
 _SAMPLES = 16  # random starts that say in what unit to measure a constraint
 _INWARDS = 0.02  # how far random starts keep from their boxes, as a share of the way to the middle
@@ -293,7 +293,7 @@ def starting_points(
 
     A start depends on its number and the seed alone.
     """
-    drawn = jax.jit(jax.vmap(_start, in_axes=(None, 0)))
+    drawn = jax.jit(jax.vmap(start, in_axes=(None, 0)))
     return drawn(origin_of(problem, seed, initial), first + jnp.arange(starts))
 
 
@@ -321,7 +321,7 @@ def origin_of(problem: Problem, seed: int, initial: Float[np.ndarray, "given dof
     return Origin(problem, given, jnp.asarray(count), jnp.asarray(seed))
 
 
-def _start(origin: Origin, number: Int[Array, ""]) -> Float[Array, " columns"]:
+def start(origin: Origin, number: Int[Array, ""]) -> Float[Array, " columns"]:
     """A given point where there is one of this number, else a random one."""
     given = origin.given[jnp.clip(number, 0, len(origin.given) - 1)]
     x0 = _random_start(origin.problem, jax.random.fold_in(jax.random.key(origin.seed), number))
@@ -329,7 +329,7 @@ def _start(origin: Origin, number: Int[Array, ""]) -> Float[Array, " columns"]:
 
 
 def solve_starts(origin: Origin, numbers: Int[Array, " chunk"], iterations: int, lanes: int) -> Outcome:
-    x0 = jax.vmap(lambda number: _start(origin, number))(numbers)
+    x0 = jax.vmap(lambda number: start(origin, number))(numbers)
     share = jnp.where(numbers < PRECISE, _PRECISION, TOLERANCE)
     return solve_chunk(
         origin.problem, x0, iterations=iterations, tolerance=share, lanes=lanes, idle=numbers < 0
@@ -412,23 +412,25 @@ def solve_chunk(
 ) -> Outcome:
     """Minimise from every point of `x0`; a pure function to be compiled, no start knows of another.
 
-    `lanes` of them take a few steps at a time, those that have taken the fewest first: what is done costs nothing
-    more, and no start waits for the slowest. `idle` ones stay where they are.
+    `lanes` of them take steps at a time; `idle` ones stay where they are.
     """
-    lanes, n = min(lanes, len(x0)), 10 * problem.dof
-    left = lambda state: ~state.done & (state.steps < iterations)
-
-    def go_on(state: interior.State) -> interior.State:
-        chosen = jnp.argsort(jnp.where(left(state), state.steps, iterations + 1))[:lanes]
-        part = jax.tree.map(lambda leaf: leaf[..., chosen], state)
-        part = jax.lax.fori_loop(0, _SEGMENT, lambda _, part: interior.step(problem, part, iterations), part)
-        return jax.tree.map(lambda whole, new: whole.at[..., chosen].set(new), state, part)
-
     state = interior.initialise(problem, x0.T, jnp.broadcast_to(jnp.asarray(tolerance, float), len(x0)))
     if idle is not None:
         state = eqx.tree_at(lambda state: state.done, state, idle)
-    state = jax.lax.while_loop(lambda state: jnp.any(left(state)), go_on, state)
-    phi = jnp.einsum("lpq,lqb->blp", problem.to_phi, state.u[:n].reshape(problem.dof, 10, -1))
+    take = lambda state: interior.step(problem, state, iterations)
+    state = in_turns(take, state, iterations, lanes)
+    return outcome(problem, state.u, state.done, state.accepted)
+
+
+def outcome(
+    problem: Problem,
+    u: Float[Array, "columns starts"],
+    done: Bool[Array, " starts"],
+    iterations: Int[Array, " starts"],
+) -> Outcome:
+    """In SI units, with what is violated."""
+    n = 10 * problem.dof
+    phi = jnp.einsum("lpq,lqb->blp", problem.to_phi, u[:n].reshape(problem.dof, 10, -1))
     violation = jax.vmap(lambda phi: largest_violation(problem.limits, phi))(phi)
-    extra = (state.u[n:] * problem.extra_unit[:, None]).T
-    return Outcome(phi, extra, violation, state.done & (violation == 0), state.accepted)
+    extra = (u[n:] * problem.extra_unit[:, None]).T
+    return Outcome(phi, extra, violation, done & (violation == 0), iterations)

@@ -31,6 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 from . import definite, small
 from .constraints import Links
 from .outcome import XYZ_COLUMN, XYZ_ROW, Limits
+from .turns import AbstractSteps
 
 # Where m, h and Sigma stand among the ten entries of a link's scaled pseudo-inertia, `small.PAIRS`.
 MASS = small.PAIRS.index((3, 3))
@@ -101,7 +102,7 @@ class Margins(eqx.Module):
     user: Float[Array, "user lanes"]
 
 
-class State(eqx.Module):
+class State(AbstractSteps):
     u: Float[Array, "columns lanes"]
     start: Float[Array, "columns lanes"]
     tolerance: Float[Array, " lanes"]
@@ -125,10 +126,10 @@ class State(eqx.Module):
 def matrices(problem: Problem, u: Float[Array, "columns lanes"]) -> small.Matrices:
     """S of every link."""
     inset = jnp.asarray(np.diag([1.0, 1.0, 1.0, 0.0]))[:, :, None] * problem.shift[:, None, None, None]
-    return small.symmetric(_of_links(problem, u)) - inset
+    return small.symmetric(of_links(problem, u)) - inset
 
 
-def _of_links(problem: Problem, u: Float[Array, "columns lanes"]) -> Float[Array, "dof 10 lanes"]:
+def of_links(problem: Problem, u: Float[Array, "columns lanes"]) -> Float[Array, "dof 10 lanes"]:
     return u[: 10 * problem.dof].reshape(problem.dof, 10, -1)
 
 
@@ -157,7 +158,7 @@ def user_margins(problem: Problem, u: Float[Array, " columns"]) -> Float[Array, 
 def _margins(problem: Problem, u: Float[Array, "columns lanes"]) -> Margins:
     boxes = jnp.zeros((problem.dof, 6, 0, u.shape[1]), u.dtype)
     if problem.boxed:
-        six = _inertia_entries(_of_links(problem, u)) * problem.inertia_unit[:, None, None]
+        six = _inertia_entries(of_links(problem, u)) * problem.inertia_unit[:, None, None]
         box = problem.inertia_box[..., None]
         boxes = jnp.stack([six - box[:, :, 0], box[:, :, 1] - six], 2)
     user = jax.vmap(lambda u: user_margins(problem, u) / problem.user_unit, -1, -1)(u)
@@ -206,7 +207,7 @@ def _model(problem: Problem, state: State, value: _Value):
     n = 10 * problem.dof
     gradient = 2 * problem.A.T @ value.residual
     blocks = jnp.zeros(())
-    link = _of_links(problem, state.u)
+    link = of_links(problem, state.u)
     if problem.boxed:
         along = lambda e: jax.jvp(_inertia_entries, (link,), (jnp.broadcast_to(e[:, None], link.shape),))[1]
         E = (
@@ -228,14 +229,20 @@ def _model(problem: Problem, state: State, value: _Value):
     return gradient, blocks, rows
 
 
+def of_link_boxes(problem: Problem, ratio: Float[Array, "linear lanes"]) -> Float[Array, "dof 10 10 lanes"]:
+    """What the boxes of each link add to the matrix of its unknowns: Gᵀ ratio G."""
+    dof, first = problem.dof, PER_LINK * problem.dof
+    each = np.arange(dof)
+    of_boxes = problem.G[:first, : 10 * dof].reshape(dof, PER_LINK, dof, 10)[each, :, each]
+    squares = of_boxes[:, :, :, None] * of_boxes[:, :, None]
+    return jnp.einsum("lcqr,lcb->lqrb", squares, ratio[:first].reshape(dof, PER_LINK, -1))
+
+
 def _assemble(problem: Problem, blocks, rows, ratio, damping) -> Float[Array, "lanes columns columns"]:
     """The step's matrix: lanes first, as the library's Cholesky wants them."""
     n, dof, first = 10 * problem.dof, problem.dof, PER_LINK * problem.dof
     lanes, columns = ratio.shape[1], len(problem.Q)
-    each = np.arange(dof)
-    of_boxes = problem.G[:first, :n].reshape(dof, PER_LINK, dof, 10)[each, :, each]
-    squares = of_boxes[:, :, :, None] * of_boxes[:, :, None]
-    blocks = blocks + jnp.einsum("lcqr,lcb->lqrb", squares, ratio[:first].reshape(dof, PER_LINK, lanes))
+    blocks = blocks + of_link_boxes(problem, ratio)
     blocks = jax.lax.optimization_barrier(jnp.moveaxis(blocks, -1, 0))
     spread = (blocks[:, :, :, None] * jnp.eye(dof)[:, None, :, None]).reshape(lanes, n, n)
     diagonal = jnp.broadcast_to(damping[:, None], (lanes, columns))
@@ -254,15 +261,23 @@ def _assemble(problem: Problem, blocks, rows, ratio, damping) -> Float[Array, "l
     return H + diagonal[:, :, None] * jnp.eye(columns)
 
 
+def barrier(
+    problem: Problem, u: Float[Array, "columns lanes"]
+) -> tuple[small.Matrices, Float[Array, "linear lanes"], Float[Array, "columns lanes"]]:
+    """$S^{-1}$, 1/s, and the barrier's gradient, negative."""
+    S_inverse = small.inverse(matrices(problem, u))
+    of_linear = 1 / (problem.G @ u + problem.d[:, None])
+    gradient = problem.G.T @ of_linear
+    gradient = gradient.at[: 10 * problem.dof].add(small.adjoint(S_inverse).reshape(-1, u.shape[1]))
+    return S_inverse, of_linear, gradient
+
+
 def initialise(
     problem: Problem, u: Float[Array, "columns lanes"], tolerance: Float[Array, " lanes"]
 ) -> State:
     """On the path's beginning."""
     lanes = u.shape[1]
-    S_inverse = small.inverse(matrices(problem, u))
-    s = problem.G @ u + problem.d[:, None]
-    pull = problem.G.T @ (1 / s)
-    pull = pull.at[: 10 * problem.dof].add(small.adjoint(S_inverse).reshape(-1, lanes))
+    S_inverse, of_linear, pull = barrier(problem, u)
     margins = _margins(problem, u)
     fresh = jnp.zeros(lanes, int)
     state = State(
@@ -270,7 +285,7 @@ def initialise(
         start=u,
         tolerance=tolerance,
         Z=S_inverse,
-        z=1 / s,
+        z=of_linear,
         pull=pull,
         pulled=jnp.ones(lanes),
         multipliers=jax.tree.map(jnp.zeros_like, margins),
@@ -326,7 +341,7 @@ def step(problem: Problem, state: State, most: int) -> State:
         of_s = (target - ds * dz) / s
         rhs = G.T @ of_s - gradient - target * away
         du = solve(rhs.at[:n].add(small.adjoint(of_S).reshape(n, -1)))
-        dS, ds = small.symmetric(_of_links(problem, du)), G @ du
+        dS, ds = small.symmetric(of_links(problem, du)), G @ du
         dZ = of_S - state.Z - small.symmetric_part(small.product(small.product(S_inverse, dS), state.Z))
         dz = of_s - state.z - state.z / s * ds
         dS, dZ = jax.lax.optimization_barrier((dS, dZ))

@@ -1,0 +1,38 @@
+"""Many lanes that take steps, some of them at a time, until all are done."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+_SEGMENT = 3  # steps between two choices of who goes on
+
+
+class AbstractSteps(eqx.Module):
+    """State of lanes; every array has the lanes last."""
+
+    steps: eqx.AbstractVar[Int[Array, " lanes"]]
+    """How many each has taken."""
+    done: eqx.AbstractVar[Bool[Array, " lanes"]]
+
+
+_State = TypeVar("_State", bound=AbstractSteps)
+
+
+def in_turns(step: Callable[[_State], _State], state: _State, most: int, lanes: int) -> _State:
+    """Let so many lanes at a time take a few steps, those that have taken the fewest first.
+
+    Until all are done or have taken the most: what is done costs nothing more, and no lane waits for the slowest.
+    """
+    left = lambda state: ~state.done & (state.steps < most)
+
+    def go_on(state: _State) -> _State:
+        chosen = jnp.argsort(jnp.where(left(state), state.steps, most + 1))[: min(lanes, len(state.steps))]
+        part = jax.tree.map(lambda leaf: leaf[..., chosen], state)
+        part = jax.lax.fori_loop(0, _SEGMENT, lambda _, part: step(part), part)
+        return jax.tree.map(lambda whole, new: whole.at[..., chosen].set(new), state, part)
+
+    return jax.lax.while_loop(lambda state: jnp.any(left(state)), go_on, state)
