@@ -47,7 +47,7 @@ def test_a_recording_of_another_length_compiles_nothing_new():
 
 @pytest.mark.parametrize("effect", [CoulombFriction(1, 0.01), PreslidingHysteresis(1, 0.01, "jenkins whole")])
 def test_columns_by_stretches_are_those_of_the_whole_recording(effect):
-    s = channels(4500)
+    s = channels(20000)
     whole = effect.columns(jax.tree.map(jax.numpy.asarray, s), 0.002)
     assert joint_columns([effect], s, 0.002)[0] == pytest.approx(np.asarray(whole), abs=1e-12)
 

@@ -16,8 +16,8 @@ from ..recordings import Recording, load, load_many
 from ..rollout import compare
 from . import page
 from .diagnosis import Diagnosis, diagnose, predict
+from .host import on_host
 from .knowledge import Knowledge
-from .scan import on_host
 
 
 @dataclasses.dataclass(frozen=True)

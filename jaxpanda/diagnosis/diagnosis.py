@@ -22,11 +22,11 @@ from ..recordings import Recording, load
 from . import knowledge as knowledge_
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import Finding, coefficients, findings, partly
+from .host import on_host
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
-from .scan import on_host
 from .search import State, transferable
 from .traces import Trace, prepare
 

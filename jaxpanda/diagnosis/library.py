@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import CATALOGUE, AbstractArmEffect, AbstractEffect, AbstractJointEffect, joint_columns
+from .host import parallel
 from .traces import Trace
 
-_BATCH = 16
-"""Shapes that one compiled call takes, for the grid and for refinement alike."""
+_BATCHES = 4, 16
+"""Shapes that one compiled call takes: what a refinement tries at once, and a grid."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,10 +36,10 @@ def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndar
     """Columns of shapes of one class and form: `(time, m, n)` in one joint, `(time, dof, m, n)` in the arm."""
     local = [e for e in effects if isinstance(e, AbstractJointEffect)]
     if local:
-        parts = []
-        for start in range(0, len(local), _BATCH):
-            batch = list(local[start : start + _BATCH])
-            filled = batch + [batch[-1]] * (_BATCH - len(batch))
+        parts, size = [], next((n for n in _BATCHES if n >= len(local)), _BATCHES[-1])
+        for start in range(0, len(local), size):
+            batch = list(local[start : start + size])
+            filled = batch + [batch[-1]] * (size - len(batch))
             parts.append(joint_columns(filled, trace.channels, trace.dt)[: len(batch)])
         return trace.down(np.moveaxis(np.concatenate(parts), 0, 1))
     arm = [e for e in effects if isinstance(e, AbstractArmEffect)]
@@ -53,14 +54,16 @@ def form_of(effect: AbstractEffect) -> tuple[str, str]:
 def build(traces: Sequence[Trace]) -> list[Candidates]:
     """The catalogue's grids on these recordings."""
     arm = traces[0].motion.arm
-    out = []
+    groups: dict[tuple, list[AbstractEffect]] = defaultdict(list)
     for effect_class in CATALOGUE:
-        groups: dict[tuple, list[AbstractEffect]] = defaultdict(list)
         for effect in effect_class.grid(arm):
             groups[form_of(effect)].append(effect)
-        for effects in groups.values():
-            out += _by_joint(effects, [columns_of(effects, trace) for trace in traces])
-    return out
+    for trace in traces:  # made once, before there are threads
+        trace.motion.load, trace.motion.regressor, trace.motion.mass, trace.motion.slope  # noqa: B018
+    evaluated = parallel(
+        lambda effects: _by_joint(effects, [columns_of(effects, trace) for trace in traces]), groups.values()
+    )
+    return [candidates for group in evaluated for candidates in group]
 
 
 def _by_joint(effects: Sequence[AbstractEffect], columns: Sequence[np.ndarray]) -> list[Candidates]:

@@ -21,7 +21,6 @@ import scipy.stats
 from jaxtyping import Float
 
 from .evidence import Design, Noise
-from .noise import saturated_columns
 from .problem import Problem, Term
 from .traces import Trace
 
@@ -180,10 +179,10 @@ def unbiased(problem: Problem, terms: Sequence[Term], noise: Noise) -> Noise:
             continue
         here = [t for t in terms if any(np.any(c[:, j]) for c in t.columns)]
         extra = [
-            np.concatenate([problem.ripples[j][r], *(t.columns[r][:, j] for t in here)], 1)
+            np.concatenate([problem.saturation.ripples[j][r], *(t.columns[r][:, j] for t in here)], 1)
             for r in range(len(problem.traces))
         ]
-        A = saturated_columns(problem.traces, j, extra)
+        A = problem.saturation.columns(j, extra)
         A = A / np.maximum(np.sqrt((A**2).sum(0)), 1e-12)
         values, vectors = np.linalg.eigh(A.T @ A)
         kept = values > 1e-9 * values[-1]

@@ -5,15 +5,18 @@ correlated noise, and hide it. A saturated fit (rigid body with free parameters,
 velocity, load and time) takes any effect away first, as well as it can, at the price of its degrees of freedom.
 """
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
+from .host import parallel
 from .traces import Trace
 
 ORDER = 3
+_RANK = 1e-6  # least singular value that counts, as a share of the largest
 
 
 def hats(x: Float[np.ndarray, " _time"], count: int) -> Float[np.ndarray, "_time _count"]:
@@ -24,43 +27,74 @@ def hats(x: Float[np.ndarray, " _time"], count: int) -> Float[np.ndarray, "_time
     return np.stack([np.interp(x, knots, e) for e in np.eye(len(knots))], 1)
 
 
-def saturated_columns(
-    traces: Sequence[Trace], joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]]
-) -> Float[np.ndarray, "_rows _n"]:
-    """Columns of the saturated model in a joint of all recordings, one below the other, zero in their gaps."""
+class Saturation:
+    """The saturated model of some recordings, joint by joint: one below the other, zero in their gaps."""
 
-    def stacked(part) -> np.ndarray:
-        return np.concatenate([np.asarray(part(trace)) for trace in traces])
+    def __init__(self, traces: Sequence[Trace]):
+        self.traces = tuple(traces)
+        self._bases: dict[int, tuple[np.ndarray, float]] = {}
 
-    Q, s, _ = np.linalg.svd(stacked(lambda t: t.motion.regressor[:, joint]), full_matrices=False)
-    rigid = Q[:, s > 1e-7 * s[0]]
-    q, qd = stacked(lambda t: t.motion.q[:, joint]), stacked(lambda t: t.motion.qd[:, joint])
-    load = stacked(lambda t: t.motion.load[:, joint])
-    sign = stacked(lambda t: t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / 0.01)))
-    rates = [np.gradient(t.motion.load[:, joint], t.motion.dt) for t in traces]
-    bends = [np.gradient(rate, t.motion.dt) for rate, t in zip(rates, traces, strict=True)]
-    swings = np.stack([np.concatenate(rates), np.concatenate(bends)], 1)
-    speed = hats(np.abs(qd), 8)
-    clock = scipy.linalg.block_diag(*[hats(t.motion.time, 10) for t in traces])
-    shaken = stacked(lambda t: t.shaken[:, joint])
-    smooth = [rigid, shaken, hats(q, 10), speed, hats(load, 5), swings, clock]
-    rough = [sign[:, None] * x for x in (speed, hats(q, 4), hats(load, 3), clock[:, ::2])]
-    A = np.concatenate([*smooth, *rough, *([np.concatenate(list(extra))] if extra else [])], 1)
-    return A * np.concatenate([t.weights[:, joint] for t in traces])[:, None]
+    def columns(
+        self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]] = ()
+    ) -> Float[np.ndarray, "_rows _n"]:
+        """All columns of a joint, `extra` ones of each recording last."""
 
+        def stacked(part) -> np.ndarray:
+            return np.concatenate([np.asarray(part(trace)) for trace in self.traces])
 
-def saturated_residual(
-    traces: Sequence[Trace],
-    residual: Sequence[Float[np.ndarray, "_time dof"]],
-    joint: int,
-    extra: Sequence[Float[np.ndarray, "_time _n"]],
-) -> tuple[list[Float[np.ndarray, " _time"]], int]:
-    """What the saturated model leaves in a joint of each recording, and its degrees of freedom."""
-    U, s, _ = np.linalg.svd(saturated_columns(traces, joint, extra), full_matrices=False)
-    U = U[:, s > 1e-6 * s[0]]
-    r = np.concatenate([x[:, joint] * t.weights[:, joint] for x, t in zip(residual, traces, strict=True)])
-    left = r - U @ (U.T @ r)
-    return np.split(left, np.cumsum([t.motion.samples for t in traces])[:-1]), U.shape[1]
+        traces = self.traces
+        Q, s, _ = np.linalg.svd(stacked(lambda t: t.motion.regressor[:, joint]), full_matrices=False)
+        rigid = Q[:, s > 1e-7 * s[0]]
+        q, qd = stacked(lambda t: t.motion.q[:, joint]), stacked(lambda t: t.motion.qd[:, joint])
+        load = stacked(lambda t: t.motion.load[:, joint])
+        sign = stacked(lambda t: t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / 0.01)))
+        rates = [np.gradient(t.motion.load[:, joint], t.motion.dt) for t in traces]
+        bends = [np.gradient(rate, t.motion.dt) for rate, t in zip(rates, traces, strict=True)]
+        swings = np.stack([np.concatenate(rates), np.concatenate(bends)], 1)
+        speed = hats(np.abs(qd), 8)
+        clock = scipy.linalg.block_diag(*[hats(t.motion.time, 10) for t in traces])
+        shaken = stacked(lambda t: t.shaken[:, joint])
+        smooth = [rigid, shaken, hats(q, 10), speed, hats(load, 5), swings, clock]
+        rough = [sign[:, None] * x for x in (speed, hats(q, 4), hats(load, 3), clock[:, ::2])]
+        A = np.concatenate([*smooth, *rough, *([np.concatenate(list(extra))] if len(extra) else [])], 1)
+        return A * self._weight(joint)[:, None]
+
+    def left(
+        self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]]
+    ) -> tuple[list[Float[np.ndarray, " _time"]], int]:
+        """What the model with `extra` columns leaves of the measured torque, and its degrees of freedom."""
+        if joint not in self._bases:
+            U, s, _ = np.linalg.svd(self.columns(joint), full_matrices=False)
+            self._bases[joint] = U[:, s > _RANK * s[0]], float(s[0])
+        U, largest = self._bases[joint]
+        r = np.concatenate([t.residual[:, joint] for t in self.traces]) * self._weight(joint)
+        r, used = r - U @ (U.T @ r), U.shape[1]
+        if len(extra):
+            E = np.concatenate(list(extra)) * self._weight(joint)[:, None]
+            largest = max(largest, float(np.linalg.norm(E, 2)))
+            for _ in range(2):  # once would leave rounding of what is taken off
+                E = E - U @ (U.T @ E)
+            V, s, _ = np.linalg.svd(E, full_matrices=False)
+            V = V[:, s > _RANK * largest]
+            r, used = r - V @ (V.T @ r), used + V.shape[1]
+        return np.split(r, np.cumsum([t.motion.samples for t in self.traces])[:-1]), used
+
+    def _weight(self, joint: int) -> Float[np.ndarray, " _rows"]:
+        return np.concatenate([t.weights[:, joint] for t in self.traces])
+
+    @functools.cached_property
+    def ripples(self) -> list[list[Float[np.ndarray, "_time _n"]]]:
+        """For each joint the order that the saturated model leaves most of, as columns in each recording.
+
+        They join the saturated model: a ripple would otherwise pass for noise of its own frequency.
+        """
+
+        def one(joint: int) -> list[np.ndarray]:
+            return strongest_order([t.motion.q[:, joint] for t in self.traces], self.left(joint, [])[0])
+
+        for trace in self.traces:  # made once, before there are threads
+            trace.motion.regressor, trace.motion.load, trace.shaken  # noqa: B018
+        return parallel(one, range(self.traces[0].motion.dof))
 
 
 def strongest_order(

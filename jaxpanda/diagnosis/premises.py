@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from ..effects.load import InertialParameters, Payload
 from . import knowledge as knowledge_
+from .noise import Saturation
 from .problem import Problem, Term, posed
 from .search import State, places, search
 from .traces import Trace
@@ -49,13 +50,15 @@ def pose(
     active: tuple[bool, ...],
     knowledge: knowledge_.Knowledge,
     background: Sequence[Term] = (),
+    saturated: Saturation | None = None,
 ) -> Premises:
     """The problem of these recordings under what is known."""
     arm = traces[0].motion.arm
-    empty = Problem(traces, active, tuple(t.motion.q[:, :, None][:, :, :0] for t in traces))
+    nothing = tuple(t.motion.q[:, :, None][:, :, :0] for t in traces)
+    empty = Problem(traces, active, nothing, saturated=saturated)
     spread = knowledge_.inertial_spread(arm, knowledge, empty.noise(()).std)
     columns = knowledge_.nuisance(traces, spread, knowledge)
-    problem = posed(traces, active, columns, background)
+    problem = posed(traces, active, columns, background, empty.saturation)
     return Premises(problem, spread, knowledge, problem.background)
 
 
@@ -91,7 +94,7 @@ def _contradicted(premises: Premises, state: State) -> knowledge_.Knowledge | No
         return None
     problem = premises.problem
     explained = state.design.log_evidence - problem.design((), state.noise).log_evidence
-    other = pose(problem.traces, problem.active, word, premises.background).problem
+    other = pose(problem.traces, problem.active, word, premises.background, problem.saturation).problem
     gained = other.design(state.terms, state.noise).log_evidence - state.design.log_evidence
     if gained > max(CONTRADICTION, SHARE * explained):
         return word

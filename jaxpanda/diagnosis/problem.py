@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import operator
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,9 +15,10 @@ from .. import signals as signals_
 from ..effects import AbstractEffect, AbstractJointEffect
 from . import catchall
 from .evidence import Design, Noise, OnDemand
+from .host import parallel
 from .library import Candidates, build, columns_of
-from .noise import ORDER, autoregression, saturated_residual, strongest_order
-from .scan import Block, Family, Score, Whitened, families, parallel, projected, scan
+from .noise import ORDER, Saturation, autoregression
+from .scan import Block, Family, Score, Whitened, families, projected, scan
 from .traces import Trace
 
 _MEMORY = 1 << 28
@@ -50,6 +53,12 @@ class Problem:
     nuisance: tuple[Float[np.ndarray, "_time dof _n"], ...]
     background: tuple[Term, ...] = ()
     """Effects that are known already: their columns are in the nuisance, and count as signal in the noise."""
+    saturated: Saturation | None = dataclasses.field(default=None, repr=False, compare=False)
+    """That of the same recordings, where a problem posed otherwise has made it already."""
+    _lock: threading.Lock = dataclasses.field(
+        default_factory=threading.Lock, init=False, repr=False, compare=False
+    )
+    """Of what `columns` keeps."""
 
     @property
     def dof(self) -> int:
@@ -117,21 +126,23 @@ class Problem:
 
     def columns(self, effects: Sequence[AbstractEffect]) -> list[Float[np.ndarray, "_time ..."]]:
         """Columns of shapes of one form at one place in all recordings, as `columns_of`."""
-        known = {key: self._evaluated[key] for e in effects if (key := key_of(e)) in self._evaluated}
+        with self._lock:
+            known = {key: self._evaluated[key] for e in effects if (key := key_of(e)) in self._evaluated}
         new = [e for e in effects if key_of(e) not in known]
         if new:
             columns = []
             for r, trace in enumerate(self.traces):
                 here = self.placed(new, r)
                 columns.append(columns_of(here, trace) if here else 0.0 * columns_of(new, trace))
-            if sum(c.nbytes for kept in self._later.values() for c in kept) > _MEMORY:
-                for key in self._later:
-                    del self._evaluated[key]
-                self._later.clear()
             fresh = {key_of(effect): [c[..., i, :] for c in columns] for i, effect in enumerate(new)}
-            self._later.update(fresh)
-            self._evaluated.update(fresh)
             known.update(fresh)
+            with self._lock:
+                if sum(c.nbytes for kept in self._later.values() for c in kept) > _MEMORY:
+                    for key in self._later:
+                        del self._evaluated[key]
+                    self._later.clear()
+                self._later.update(fresh)
+                self._evaluated.update(fresh)
         each = [known[key_of(e)] for e in effects]
         return [np.stack([c[r] for c in each], -2) for r in range(len(self.traces))]
 
@@ -295,19 +306,11 @@ class Problem:
         return error
 
     @functools.cached_property
-    def ripples(self) -> list[list[Float[np.ndarray, "_time _n"]]]:
-        """For each joint the order that the saturated model leaves most of, as columns in each recording.
-
-        They join the saturated model: a ripple would otherwise pass for noise of its own frequency.
-        """
-
-        def one(joint: int) -> list[np.ndarray]:
-            left, _ = saturated_residual(self.traces, self.residual, joint, [])
-            return strongest_order([t.motion.q[:, joint] for t in self.traces], left)
-
-        for trace in self.traces:  # made once, before there are threads
-            trace.motion.regressor, trace.motion.load  # noqa: B018
-        return parallel(one, range(self.dof))
+    def saturation(self) -> Saturation:
+        """What the noise is estimated by."""
+        if self.saturated is not None and all(map(operator.is_, self.saturated.traces, self.traces)):
+            return self.saturated
+        return Saturation(self.traces)
 
     @functools.cached_property
     def _noises(self) -> dict[tuple, tuple]:
@@ -325,14 +328,14 @@ class Problem:
             key = joint, *(id(t) for t in here)
             if key not in self._noises:
                 extra = [
-                    np.concatenate([self.ripples[joint][r], *(t.columns[r][:, joint] for t in here)], 1)
+                    np.concatenate([ripples[joint][r], *(t.columns[r][:, joint] for t in here)], 1)
                     for r in range(len(self.traces))
                 ]
-                parts, used = saturated_residual(self.traces, self.residual, joint, extra)
+                parts, used = self.saturation.left(joint, extra)
                 self._noises[key] = (*autoregression(parts, used), here)  # keeps what it names alive
             return self._noises[key][:3]
 
-        self.ripples  # noqa: B018 (made once, before there are threads)
+        ripples = self.saturation.ripples  # made once, before there are threads
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         return Noise(np.stack(a), np.array(sigma), np.array(std))
 
@@ -347,6 +350,7 @@ def posed(
     active: tuple[bool, ...],
     nuisance: Sequence[Float[np.ndarray, "_time dof _n"]],
     background: Sequence[Term] = (),
+    saturated: Saturation | None = None,
 ) -> Problem:
     """A problem whose background acts in all recordings: its columns, by their deviations, end the nuisance."""
     everywhere = Problem(traces, (True,) * len(traces), tuple(nuisance))
@@ -354,4 +358,4 @@ def posed(
     wide = [
         np.concatenate([n, *(t.columns[r] * t.deviation for t in terms)], 2) for r, n in enumerate(nuisance)
     ]
-    return Problem(traces, active, tuple(wide), terms)
+    return Problem(traces, active, tuple(wide), terms, saturated)

@@ -6,61 +6,26 @@ time, which never leaves the cache, and multiplied with everything in the model 
 as the noise of their joint does; then a step costs small matrices only.
 """
 
-import contextlib
 import dataclasses
-import functools
-import os
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
-from threadpoolctl import threadpool_limits
 
 from ..effects import AbstractEffect
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
+from .host import parallel
 from .library import Candidates
 from .traces import Trace
 
 if TYPE_CHECKING:
     from .problem import Problem, Term
 
-P = ParamSpec("P")
-R = TypeVar("R")
-
 _SLICE = 1 << 16
 """Numbers whitened at a time: half a megabyte."""
-
-
-def on_host(work: Callable[P, R]) -> Callable[P, R]:
-    """Decorates what makes many small products: on the processor's cores, with no threads but ours (`parallel`).
-
-    BLAS's own threads would wait for each other and for ours; a GPU, for the next of a thousand small programs.
-    """
-
-    @functools.wraps(work)
-    def alone(*args: P.args, **kwargs: P.kwargs) -> R:
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(threadpool_limits(limits=1, user_api="blas"))
-            if jax.default_backend() != "cpu":
-                with contextlib.suppress(RuntimeError):  # JAX_PLATFORMS leaves the processor out
-                    stack.enter_context(jax.default_device(jax.local_devices(backend="cpu")[0]))
-            return work(*args, **kwargs)
-
-    return alone
-
-
-def parallel(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-    """`work` on each item, on as many threads as there are cores: large products let go of Python's lock."""
-    items, cores = list(items), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    if cores == 1 or len(items) < 2:
-        return [work(item) for item in items]
-    with ThreadPoolExecutor(min(cores, len(items))) as pool:
-        return list(pool.map(work, items))
 
 
 def whitened_slices(

@@ -16,6 +16,7 @@ from ..effects.friction import AsymmetricFriction
 from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
 from .events import BIN, Proposal, ripple, windows
 from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
+from .host import parallel
 from .library import Candidates
 from .problem import Problem, Term
 from .scan import scales_of
@@ -465,7 +466,7 @@ def ranked(
             best[p.key] = p
     order = sorted(best.values(), key=lambda p: -p.evidence)
     close = sum(p.evidence > max(_CLOSE * order[0].evidence, 4.0) for p in order[:_REFINED])
-    refined = [refine(problem, design, noise, p) for p in order[:close]]
+    refined = parallel(lambda p: refine(problem, design, noise, p), order[:close])
     refined = [p for p in refined if is_dissipative(problem, design, noise, p)]
     found = [p for p in (*refined, *order[close:]) if has_play(problem, design, noise, p)]
     return sorted(found, key=lambda p: -p.evidence)

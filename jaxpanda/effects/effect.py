@@ -314,8 +314,9 @@ class AbstractArmEffect(AbstractEffect):
         return np.stack([effect.over(motion) for effect in effects], 2)
 
 
-_STRETCH = 2048
-"""Samples that one compiled call takes: recordings of any length share its compilation."""
+_WORK = 32768
+"""Samples times shapes that one compiled call takes: recordings of any length share its compilation."""
+_LONGEST = 8192
 
 
 def joint_columns(
@@ -323,12 +324,13 @@ def joint_columns(
 ) -> Float[np.ndarray, "effects time n"]:
     """Columns of many shapes of one form at once, a stretch after the other."""
     samples, out = channels.t.shape[0], []
+    stretch = min(_WORK // len(effects), _LONGEST)
     stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *effects)
     whole = jax.tree.map(lambda a: np.asarray(a), channels)
     leaves, structure = jax.tree.flatten(stacked)
     z = np.zeros(_states(structure, tuple((a.shape, a.dtype) for a in leaves), channels.q.shape[1]))
-    for begin in range(0, samples, _STRETCH):
-        part = jax.tree.map(lambda a, begin=begin: _filled(a[begin : begin + _STRETCH]), whole)
+    for begin in range(0, samples, stretch):
+        part = jax.tree.map(lambda a, begin=begin: _filled(a[begin : begin + stretch], stretch), whole)
         z, columns = _advance(stacked, z, np.asarray(begin == 0), part, dt)
         out.append(columns)
     return np.concatenate([np.asarray(columns) for columns in out], 1)[:, :samples]
@@ -342,8 +344,8 @@ def _states(structure: Any, leaves: tuple[tuple, ...], dof: int) -> tuple[int, .
     return jax.eval_shape(_starts, effects, Channels(q[:, 0], q, q, q, q, q)).shape
 
 
-def _filled(a: np.ndarray) -> np.ndarray:
-    short = _STRETCH - len(a)
+def _filled(a: np.ndarray, length: int) -> np.ndarray:
+    short = length - len(a)
     return np.concatenate([a, np.repeat(a[-1:], short, 0)]) if short else a
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxpanda_kernels import link_poses, mass_matrix, regressor, rnea
+from jaxpanda_kernels import batched, link_poses, mass_matrix, regressor, rnea
 from jaxtyping import Array, Float, Int
 
 from ..arm import Arm
@@ -59,7 +59,10 @@ class Motion:
     @functools.cached_property
     def load(self) -> Float[np.ndarray, "time dof"]:
         """Torque of the nominal rigid arm with armature and springs [N m]: all of the model that is smooth."""
-        return self._over(_smooth_torque, self.q, self.qd, self.qdd)
+        arm = self.arm
+        rigid = self._over(_rigid_torque, self.q, self.qd, self.qdd)
+        armature, stiffness, springref = (np.asarray(x) for x in (arm.armature, arm.stiffness, arm.springref))
+        return rigid + armature * self.qdd + stiffness * (self.q - springref)
 
     @functools.cached_property
     def regressor(self) -> Float[np.ndarray, "time dof standard"]:
@@ -138,9 +141,8 @@ def smooth_torque(arm: Arm, q: Array, qd: Array, qdd: Array) -> Array:
     return rigid + arm.armature * qdd + arm.stiffness * (q - arm.springref)
 
 
-@jax.jit
-def _smooth_torque(arm, q, qd, qdd):
-    return jax.vmap(lambda *s: smooth_torque(arm, *s))(q, qd, qdd)
+def _rigid_torque(arm, *states):
+    return batched.rnea(arm.chain, arm.standard, *map(jnp.asarray, states))
 
 
 @jax.jit

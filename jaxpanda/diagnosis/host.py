@@ -1,0 +1,41 @@
+"""The processor's cores, for work that is many small products."""
+
+import contextlib
+import functools
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+from threadpoolctl import threadpool_limits
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def on_host(work: Callable[P, R]) -> Callable[P, R]:
+    """Decorates what makes many small products: on the processor's cores, with no threads but ours (`parallel`).
+
+    BLAS's own threads would wait for each other and for ours; a GPU, for the next of a thousand small programs.
+    """
+
+    @functools.wraps(work)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> R:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(threadpool_limits(limits=1, user_api="blas"))
+            if jax.default_backend() != "cpu":
+                with contextlib.suppress(RuntimeError):  # JAX_PLATFORMS leaves the processor out
+                    stack.enter_context(jax.default_device(jax.local_devices(backend="cpu")[0]))
+            return work(*args, **kwargs)
+
+    return alone
+
+
+def parallel(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+    """`work` on each item, on as many threads as there are cores: large products let go of Python's lock."""
+    items, cores = list(items), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    if cores == 1 or len(items) < 2:
+        return [work(item) for item in items]
+    with ThreadPoolExecutor(min(cores, len(items))) as pool:
+        return list(pool.map(work, items))
