@@ -37,5 +37,12 @@ def parallel(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
     items, cores = list(items), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     if cores == 1 or len(items) < 2:
         return [work(item) for item in items]
+    # A thread of its own would not know what `on_host` has chosen.
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+
+    def elsewhere(item: Any) -> Any:
+        with jax.default_device(device):
+            return work(item)
+
     with ThreadPoolExecutor(min(cores, len(items))) as pool:
-        return list(pool.map(work, items))
+        return list(pool.map(elsewhere, items))
