@@ -204,8 +204,8 @@ def diagnose(
     if dropped:
         premises = dataclasses.replace(
             premises,
-            notes=(*premises.notes, "left out of the corrected model, as what fits one recording does harm in"
-                   f" another: {', '.join(sorted(set(dropped)))}"),
+            notes=(*premises.notes, "left out of the corrected model, as torque is predicted no better with it"
+                   f" where it was not fitted: {', '.join(sorted(set(dropped)))}"),
         )  # fmt: skip
     text, warnings = _corrected_xml(source, corrected)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]

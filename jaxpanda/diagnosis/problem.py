@@ -270,40 +270,34 @@ class Problem:
 
     def held_out_error(self, design: Design, counts: Bool[np.ndarray, " rows"] | None = None) -> float:
         """Squared whitened error on blocks that the coefficients were not fitted to, in the rows that count."""
-        return self._error_on(design, self.folds, counts)
-
-    def transferred_error(self, design: Design) -> float:
-        """Squared whitened error on recordings that the coefficients were not fitted to."""
-        of = np.repeat(np.arange(len(self.traces)), [t.motion.samples for t in self.traces])
-        folds = [(of != r, of == r) for r, on in enumerate(self.active) if on]
-        return self._error_on(design, folds) if len(folds) > 1 else 0.0
-
-    def _error_on(
-        self,
-        design: Design,
-        folds: Sequence[tuple[np.ndarray, np.ndarray]],
-        counts: Bool[np.ndarray, " rows"] | None = None,
-    ) -> float:
-        """What a fold leaves out of the normal equations is subtracted from the whole's."""
-        H, g = design.information, design.g
-        less = [(np.zeros_like(H), np.zeros_like(g)) for _ in folds]
-        for A, r in zip(design.columns, design.residual, strict=True):
-            for (train, _), (dH, dg) in zip(folds, less, strict=True):
-                out, missing = A[~train], r[~train]
-                dH += out.T @ out
-                dg += out.T @ missing
         error = 0.0
-        for (_, test), (dH, dg) in zip(folds, less, strict=True):
-            unit = 1 / np.sqrt(np.diag(H - dH))  # coefficients differ in size by their units
-            x = g
-            if len(g):
-                x = unit * scipy.linalg.solve(
-                    unit[:, None] * (H - dH) * unit, unit * (g - dg), assume_a="pos"
-                )
+        for (_, test), x in zip(self.folds, _left_out(design, self.folds), strict=True):
+            rows = test if counts is None else test & counts
             for A, r in zip(design.columns, design.residual, strict=True):
-                rows = test if counts is None else test & counts
                 error += float(np.sum((r[rows] - A[rows] @ x) ** 2))
         return error
+
+    def predicted_error(self, design: Design, noise: Noise) -> tuple[float, float]:
+        """Squared error of predicted torque, over the noise's deviation, where coefficients were not fitted: with
+        the model of the design, and with the user's.
+
+        In other recordings, or in other blocks of the only one. Not whitened: as whoever takes the model to
+        predict torque would see it, slow errors count in full, and what was put down to the encoders' noise does
+        not help.
+        """
+        of = np.repeat(np.arange(len(self.traces)), [t.motion.samples for t in self.traces])
+        folds = [(of != r, of == r) for r, on in enumerate(self.active) if on]
+        folds = folds if len(folds) > 1 else self.folds
+        weight = np.concatenate([t.weights for t in self.traces]) / noise.std
+        residual = np.concatenate(self.residual)
+        parts = zip(self.nuisance, *(t.columns for t in design.terms), strict=True)
+        columns = np.concatenate([np.concatenate(part, 2) for part in parts])
+        corrected = users = 0.0
+        for (_, test), x in zip(folds, _left_out(design, folds), strict=True):
+            left = residual[test] - columns[test] @ self.explained(x)
+            corrected += float(np.sum((weight[test] * left) ** 2))
+            users += float(np.sum((weight[test] * residual[test]) ** 2))
+        return corrected, users
 
     @functools.cached_property
     def saturation(self) -> Saturation:
@@ -338,6 +332,25 @@ class Problem:
         ripples = self.saturation.ripples  # made once, before there are threads
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         return Noise(np.stack(a), np.array(sigma), np.array(std))
+
+
+def _left_out(
+    design: Design, folds: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> list[Float[np.ndarray, " n"]]:
+    """Coefficients fitted without each fold: what it holds is subtracted from the whole's normal equations."""
+    H, g = design.information, design.g
+    less = [(np.zeros_like(H), np.zeros_like(g)) for _ in folds]
+    for A, r in zip(design.columns, design.residual, strict=True):
+        for (train, _), (dH, dg) in zip(folds, less, strict=True):
+            out, missing = A[~train], r[~train]
+            dH += out.T @ out
+            dg += out.T @ missing
+    found = []
+    for dH, dg in less:
+        unit = 1 / np.sqrt(np.diag(H - dH))  # coefficients differ in size by their units
+        scaled = unit[:, None] * (H - dH) * unit
+        found.append(unit * scipy.linalg.solve(scaled, unit * (g - dg), assume_a="pos") if len(g) else g)
+    return found
 
 
 def key_of(effect: AbstractEffect) -> tuple:

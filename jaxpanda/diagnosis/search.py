@@ -34,6 +34,8 @@ SECOND_JOINT = 0.03
 force on a link turns several joints, while what is left of a joint's own effect stays in that joint."""
 HELD_OUT = 6.0
 """By which a term must lower the squared held-out error, in units of the noise's variance."""
+WORTH = 1.03
+"""By which the squared error of predicted torque must be smaller than with the user's model."""
 UNKNOWN_MARGIN, UNKNOWN_SHARE = 10.0, 0.06
 """What a free form must win by [nats, share]."""
 USUAL = {
@@ -294,21 +296,22 @@ def gate(problem: Problem, state: State, say: Any) -> State:
 
 
 def transferable(problem: Problem, state: State) -> State:
-    """Without the terms that do harm in recordings to which their coefficients were not fitted.
+    """Without the terms that make torque worse where their coefficients were not fitted; without all that can be
+    tested so, where together they gain next to nothing.
 
     What stands in for physics that has no name fits where it was fitted, and misleads elsewhere.
     """
-    while True:
-        whole = problem.transferred_error(state.design)
-        harm = {
-            i: whole - problem.transferred_error(without(state, i))
-            for i, t in enumerate(state.terms)
-            if not t.effect.bound_to_recording
-        }
-        worst = max(harm, key=lambda i: harm[i], default=None)
-        if worst is None or harm[worst] <= 0:
-            return state
-        state = with_terms(problem, (*state.terms[:worst], *state.terms[worst + 1 :]))
+    while lasting := [i for i, t in enumerate(state.terms) if not t.effect.bound_to_recording]:
+        whole, users = problem.predicted_error(state.design, state.noise)
+        harm = {i: whole - problem.predicted_error(without(state, i), state.noise)[0] for i in lasting}
+        worst = max(harm, key=lambda i: harm[i])
+        if harm[worst] > 0:
+            state = with_terms(problem, (*state.terms[:worst], *state.terms[worst + 1 :]))
+        elif users < WORTH * whole:
+            return with_terms(problem, [t for t in state.terms if t.effect.bound_to_recording])
+        else:
+            break
+    return state
 
 
 def contest(problem: Problem, state: State, say: Any) -> State:
