@@ -20,7 +20,7 @@ from .errors import InputError
 from .feasible import Bounds, Constraint, Links, Solutions, exact_penalty, solve
 from .feasible.bounds import INERTIA
 from .feasible.schedule import Device
-from .feasible.solver import STARTS
+from .feasible.solver import NOTHING, STARTS
 from .files import finite, output_folder, read_json, to_json
 from .friction import Friction
 from .identification import Identification
@@ -36,7 +36,6 @@ AS_GOOD = 1.01
 """A solution is as good as the best where its objective is within this factor of it."""
 CONCESSION = 5e-4
 """Share of the objective that may be given up to stay near the nominal parameters."""
-_NOTHING = 1e-12  # share of the coefficients' squares that counts as none
 ACTIVE = 1e-5
 """A constraint is active where its margin is below this share of its box (triangle inequality: [kg m²])."""
 _BLOCK = 16384  # starts described at once
@@ -228,7 +227,7 @@ def retrieve(
             f"{found.violation.min():.2g}); widen them, or give more starts"
         )
     best = found.objective[found.best]
-    as_good = feasible & (found.objective <= max(AS_GOOD * best, _NOTHING * float(b @ b)))
+    as_good = feasible & (found.objective <= max(AS_GOOD * best, NOTHING * float(b @ b)))
     as_good[found.best] = True
     phi, violation = found.phi[found.best], float(found.violation[found.best])
     nominal = _nominal(arm, table)
@@ -336,7 +335,7 @@ def _towards(
     scale = np.concatenate([mass, *[mass * size] * 3, *[mass * size**2] * 6], 1)
     distance = lambda phi: float(np.sum(((phi - nominal) / scale) ** 2))
     objective = lambda phi: float(np.sum((A @ phi.ravel() - b) ** 2))
-    room = CONCESSION * objective(best) + _NOTHING * float(b @ b)
+    room = CONCESSION * objective(best) + NOTHING * float(b @ b)
     root = np.sqrt(room / max(distance(best), 1e-300))
     pulled = solve(
         np.concatenate([A, np.diag(root / scale.ravel())]),

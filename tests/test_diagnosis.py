@@ -246,10 +246,8 @@ def test_what_fits_one_recording_only_is_left_out_of_the_corrected_model():
     ).problem  # fmt: skip
     terms = [problem.term(TorqueOffset(1), np.array([1.0]))]
     assert transferable(problem, with_terms(problem, terms)).terms == ()
-    twice = [
-        *terms,
-        problem.term(TorqueOffset(1), np.array([2.0])),
-    ]  # without one the other does the same harm
+    # Without one of two the other does the same harm.
+    twice = [*terms, problem.term(TorqueOffset(1), np.array([2.0]))]
     assert transferable(problem, with_terms(problem, twice)).terms == ()
     same = pose(
         tuple(prepare(record(k, offset(1.0)), Arm.panda()) for k in (20, 21)), (True, True), "exact"

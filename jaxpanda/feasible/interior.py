@@ -38,6 +38,8 @@ MASS = small.PAIRS.index((3, 3))
 FIRST = [small.PAIRS.index((k, 3)) for k in range(3)]
 PER_LINK = 8
 """Linear constraints of a link: its mass and its centre of mass, from below and above."""
+MET = 1e-14
+"""Share of the right-hand side's square that counts as nothing left."""
 
 _TO_BOUNDARY = 0.95
 _LEAST_DAMPING, _SLIGHT_DAMPING = 1e-12, 1e-3
@@ -327,7 +329,7 @@ def step(problem: Problem, state: State, most: int) -> State:
     H = _assemble(problem, blocks, rows, state.z / s, state.damping + nearness)
     factor = definite.factor(H)
     solve = lambda rhs: definite.solve(factor, rhs.T).T
-    nothing_left = 1e-14 * jnp.sum(problem.b**2)
+    nothing_left = MET * jnp.sum(problem.b**2)
     solved = state.tolerance * value.objective + nothing_left
 
     def direction(corrects, before):

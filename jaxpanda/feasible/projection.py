@@ -25,8 +25,6 @@ from .interior import Problem
 from .outcome import Outcome
 from .turns import AbstractSteps, in_turns
 
-MET = 1e-14
-"""Share of the right-hand side's square that may be left."""
 MOST = 40
 """Steps; most starts need seven."""
 
@@ -86,7 +84,7 @@ def step(origin: Origin, state: State) -> State:
     active = ~state.done & (state.steps < MOST)
     G, Z, z = problem.G, state.Z, state.z
     S, s = interior.matrices(problem, state.u), G @ state.u + problem.d[:, None]
-    S_inverse = small.inverse(S)
+    S_inverse, _, gradient = interior.barrier(problem, state.u)
     ratio = z / s
     blocks = small.curvature(S_inverse, Z) + interior.of_link_boxes(problem, ratio)
     blocks = jax.lax.optimization_barrier(jnp.moveaxis(blocks, -1, 0))
@@ -104,9 +102,7 @@ def step(origin: Origin, state: State) -> State:
     )
     H_to_meet = free[:n].T @ H_to_meet.T + G_free.T @ (ratio[rows] * (G[rows] @ to_meet))
 
-    rhs = G.T @ (1 / s) - state.pull
-    rhs = rhs.at[:n].add(small.adjoint(S_inverse).reshape(n, lanes))
-    rhs = free.T @ rhs - H_to_meet
+    rhs = free.T @ (gradient - state.pull) - H_to_meet
     du = to_meet + free @ definite.solve(definite.factor(H), rhs.T).T
     dS, ds = small.symmetric(interior.of_links(problem, du)), G @ du
     dZ = S_inverse - Z - small.symmetric_part(small.product(small.product(S_inverse, dS), Z))
@@ -127,5 +123,5 @@ def step(origin: Origin, state: State) -> State:
         z=move(z, dual, dz),
         pull=state.pull,
         steps=state.steps + active,
-        done=state.done | (active & (left <= MET * jnp.sum(problem.b**2))),
+        done=state.done | (active & (left <= interior.MET * jnp.sum(problem.b**2))),
     )

@@ -27,9 +27,10 @@ from .outcome import extra_box
 
 STARTS = 2048
 """Default number of random starts."""
+NOTHING = 1e-12
+"""Share of the right-hand side's square that may be left where links meet the equations exactly."""
 _TRIED = 64  # starts that tell whether a way suits the problem
 _ENOUGH, _ALMOST_ALL = 0.5, 0.9  # share of them that must converge; where there is a sure way as well
-_NOTHING = 1e-12  # share of the right-hand side's square that is left where links meet the equations exactly
 _BLOCK = 4096  # starts whose objective is evaluated at once
 
 
@@ -150,19 +151,18 @@ def solve(
             return None
         return path._replace(solve_starts=projection.solve_starts, origin=origin, options=path.options[1:])
 
-    def serves(way: _Way, share: float, met: float = np.inf) -> bool:
-        """Whether enough of a few starts converge, to an objective of no more than this."""
-        tried = go(way, min(starts, _TRIED))
-        return bool(np.mean(tried.converged & (_objectives(A, b, tried.phi, tried.extra) <= met)) >= share)
+    def share_of(tried: Any, most: float = np.inf) -> float:
+        """How many of a few starts converged, to an objective of no more than this."""
+        return float(np.mean(tried.converged & (_objectives(A, b, tried.phi, tried.extra) <= most)))
 
-    way = along_the_path() if convex.suits(bounds, extra) else by_newton()
+    way, few = along_the_path() if convex.suits(bounds, extra) else by_newton(), min(starts, _TRIED)
     if way.solve_starts is convex.solve_starts:
-        nothing = _NOTHING * float(b @ b)
-        exact = projected(way)
-        if constraints and not serves(way, _ENOUGH):
+        nothing, exact = NOTHING * float(b @ b), projected(way)
+        tried = go(way, few) if constraints or exact is not None else None
+        if constraints and share_of(tried) < _ENOUGH:
             way = by_newton()
-        elif exact is not None and serves(way, _ENOUGH, nothing) and serves(exact, _ALMOST_ALL, nothing):
-            way = exact
+        elif exact is not None and share_of(tried, nothing) >= _ENOUGH:
+            way = exact if share_of(go(exact, few), nothing) >= _ALMOST_ALL else way
     kept = None
     if checkpoint is not None:
         kept = Checkpoint(
