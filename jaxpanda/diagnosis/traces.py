@@ -34,6 +34,9 @@ _REST = 5.0
 """Noise of the velocity within which a joint counts as at rest, in standard deviations."""
 _GAP, _NEAR = 3.5, 0.12
 """Missing steps that make a gap, and how far beyond it samples do not count [s]."""
+_TURN = 0.01
+"""How long before or after a joint turns its known friction may [s]: MuJoCo's constraint does so before the
+velocity changes sign, the friction of a gear after it, and a filtered velocity shows neither."""
 _SHAKEN = (2.5, 5.0)
 """Where the bands begin in which noise of q, differentiated twice, may outweigh the motion [Hz]."""
 _SHARPER, _SHARP = 2.5, 6.0
@@ -164,7 +167,7 @@ def prepare(
     cutoff = min(0.4 * rate / stride, 0.45 * rate)
 
     sign = held_sign(arm, qd[fine], qdd[fine], width)
-    doubtful = _unsure_sign(position, qd, width, cutoff_q, rate)[fine][kept]
+    doubtful = _unsure_sign(position, qd, width + _TURN * np.abs(qdd), cutoff_q, rate)[fine][kept]
     held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
     held, tau = held_fine[kept], None if rough.tau is None else rough.tau[keep]
     if stride > thin:
@@ -217,14 +220,14 @@ def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):
 def _unsure_sign(
     q: Float[np.ndarray, "time dof"],
     qd: Float[np.ndarray, "time dof"],
-    least: Float[np.ndarray, " dof"],
+    least: Float[np.ndarray, "time dof"],
     cutoff: float,
     rate: float,
 ) -> Float[np.ndarray, "time dof"]:
     """1 where the sign of the velocity cannot be told, else 0; with what filters make of it nearby.
 
     Before a joint sets out from rest, a sharp filter swings to the other side. A velocity smaller than its
-    difference from that of a filter that does not ring, or than its noise, has no sign.
+    difference from that of a filter that does not ring, or than `least`, has no sign.
     """
     width = rate * np.sqrt(np.log(2)) / (2 * np.pi * cutoff)
     smooth = scipy.ndimage.gaussian_filter1d(q, width, 0, mode="nearest", truncate=6.0)
@@ -237,11 +240,12 @@ def _unsure_sign(
 def _cut_off(
     q: Float[np.ndarray, "time dof"], qdd: Float[np.ndarray, "time dof"], cutoff: float, rate: float
 ) -> Float[np.ndarray, "time dof"]:
-    """Acceleration that the filter of q takes away [rad/s²]: where it is far above its noise, else 0."""
+    """Acceleration that the filter of q takes away [rad/s²]: where it is far above its noise, and as long as the
+    filter rings around there; else 0."""
     lost = np.abs(_derivatives(q, min(_SHARPER * cutoff, 0.4 * rate), rate)[2] - qdd)
     noise = np.median(lost, axis=0) / 0.6745
     lost = np.where(lost > _SHARP * noise, lost, 0.0)
-    return scipy.ndimage.maximum_filter1d(lost, 2 * round(rate * 2 * _BESIDE) + 1, axis=0)
+    return scipy.ndimage.maximum_filter1d(lost, 2 * round(rate / cutoff) + 1, axis=0)
 
 
 def held_sign(
