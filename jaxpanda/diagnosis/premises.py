@@ -10,6 +10,8 @@ Two premises come from the user: how well the model's numbers are known, and rec
   under a wider word of `knowledge`, beside all effects found, the search is repeated with that word. So it is if
   that word alone does better than the inertial parameters of several links that were found to be wrong, or of
   one by less than the noise.
+- "Identified" says not by which motion, and a poor one leaves more. If the recordings are as likely with less
+  found and `LOOSE` times an identification's uncertainty, that is what is supposed.
 """
 
 import dataclasses
@@ -22,13 +24,15 @@ from ..effects.load import InertialParameters, Payload
 from . import knowledge as knowledge_
 from .noise import Saturation
 from .problem import Problem, Term, posed
-from .search import State, places, search
+from .search import ACCEPT, State, gains, places, search
 from .traces import Trace
 
 CONTRADICTION, SHARE = 100.0, 0.03
 """Evidence by which recordings contradict what is said to be known: nats, and as a share of what the effects
 explain, whose shapes are never quite right and leave something for any freedom to take."""
 
+LOOSE = 20.0
+"""Multiple of the uncertainty of a model that was identified, where its motion excited the arm less."""
 _SEVERAL = 2
 
 
@@ -51,12 +55,13 @@ def pose(
     knowledge: knowledge_.Knowledge,
     background: Sequence[Term] = (),
     saturated: Saturation | None = None,
+    scale: float = 1.0,
 ) -> Premises:
-    """The problem of these recordings under what is known."""
+    """The problem of these recordings under what is known; `scale` multiplies the uncertainty of the inertias."""
     arm = traces[0].motion.arm
     nothing = tuple(t.motion.q[:, :, None][:, :, :0] for t in traces)
     empty = Problem(traces, active, nothing, saturated=saturated)
-    spread = knowledge_.inertial_spread(arm, knowledge, empty.noise(()).std)
+    spread = scale * knowledge_.inertial_spread(arm, knowledge, empty.noise(()).std)
     columns = knowledge_.nuisance(traces, spread, knowledge)
     problem = posed(traces, active, columns, background, empty.saturation)
     return Premises(problem, spread, knowledge, problem.background)
@@ -78,6 +83,7 @@ def settled(
     while True:
         premises = dataclasses.replace(pose(traces, active, knowledge, background), notes=notes)
         state = search(premises.problem, log)
+        premises, state = _loosened(premises, state, log)
         wider = _contradicted(premises, state)
         if wider is None:
             return premises, state
@@ -85,6 +91,40 @@ def settled(
                  f" they were taken as {wider!r}")  # fmt: skip
         log.append(notes[-1])
         knowledge = wider
+
+
+def _loosened(premises: Premises, state: State, log: list[str]) -> tuple[Premises, State]:
+    """What an identification by a poorer motion leaves to find, if the recordings are as likely with that."""
+    if premises.knowledge != "identified" or not state.terms:
+        return premises, state
+    problem = premises.problem
+    loose = pose(problem.traces, problem.active, "identified", premises.background, problem.saturation, LOOSE)
+    loose = dataclasses.replace(loose, notes=premises.notes)
+    fewer = _needed(loose.problem, state)
+    if _credit(fewer) <= _credit(state):
+        return premises, state
+    if len(fewer.terms) == len(state.terms):
+        return loose, fewer
+    log.append(f"the model's numbers may have been identified {LOOSE:g} times less well: searched again so")
+    other = search(loose.problem, log)
+    before = State(state.terms, other.noise, problem.design(state.terms, other.noise))
+    return (loose, other) if _credit(other) > _credit(before) else (premises, state)
+
+
+def _needed(problem: Problem, state: State) -> State:
+    """The terms that still have evidence in another problem, the weakest dropped first."""
+    terms = list(state.terms)
+    while True:
+        whole = State(tuple(terms), state.noise, problem.design(terms, state.noise))
+        gained = gains(whole)
+        if not terms or min(gained) > ACCEPT:
+            return whole
+        del terms[int(np.argmin(gained))]
+
+
+def _credit(state: State) -> float:
+    """Evidence, less what every claim must earn [nats]."""
+    return state.design.log_evidence - ACCEPT * len(state.terms)
 
 
 def _contradicted(premises: Premises, state: State) -> knowledge_.Knowledge | None:
