@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ..effects import AbstractEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import TorqueRipple
-from ..effects.load import PayloadChange
+from ..effects.load import EVER, PayloadChange
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes, log_mean_exp
 from .problem import Problem
 
@@ -117,7 +117,7 @@ def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal
         switches = np.arange(_EDGE, count - _EDGE)
         gained = np.stack([switches, np.full_like(switches, count)], 1)
         lost = np.stack([np.zeros_like(switches), switches], 1)
-        for form, spans in (("gained", gained), ("lost", lost)):
+        for form, spans in (("gained", gained), ("lost", lost), ("carried", pairs)):
             if len(spans):
                 sums = _window_sums((b[:, n:], H, C[:, :, n:]), spans)
                 yield from _events([dataclasses.replace(change, form=form)], [sums], stops, spans)
@@ -190,7 +190,7 @@ def _events(effects, found, clock, pairs) -> Iterator[Proposal]:
         top = int(score.argmax())
         start, stop = float(clock[pairs[top, 0]]), float(clock[pairs[top, 1]])
         if isinstance(effect, PayloadChange):
-            start, stop = (start, 1e9) if effect.form == "gained" else (-1e9, stop)
+            start, stop = start if effect.form != "lost" else -EVER, stop if effect.form != "gained" else EVER
         placed = dataclasses.replace(effect, start=start, stop=stop)
         evidence = float(log_mean_exp(score))
         yield Proposal(placed, evidence, float(score[top]), deviation[0] * scale[top], (BIN, BIN))

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
-from ..effects.drive import Backlash
+from ..effects.drive import Backlash, JointElasticity
 from ..effects.friction import AsymmetricFriction
 from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
 from .events import BIN, Proposal, ripple, windows
@@ -256,7 +256,8 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
     $\max(\text{ACCEPT}, \epsilon \sum_k g_k \sum_j s_{ij} s_{kj})$ with the evidence $g_k$ of each
     stronger term, the share $s_{ij}$ of the term's torque (squared, over noise) that acts in joint j, and the
     share $s_{kj}$ of the stronger one's that acts in joint j while the term does. What is strong in one joint
-    casts no shadow on another.
+    casts no shadow on another. A soft joint's swings and a gap's impacts come at moments that the fitted law has
+    elsewhere: their shadow falls on all times.
     """
     energy = energies(state)
     total = np.maximum(energy.sum((1, 2)), 1e-300)
@@ -264,9 +265,13 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
     for i, term in enumerate(state.terms):
         where = energy[i].sum(1) / total[i]
         once = term.effect.bound_to_recording
-        rows = energy[i].any(0) if once else slice(None)
-        stronger = [k for k in range(len(total)) if gained[k] > gained[i]]
-        beside = sum(gained[k] * float(where @ energy[k][:, rows].sum(1)) / total[k] for k in stronger)
+        rows = energy[i].any(0) if once else np.ones(energy.shape[2], bool)
+        beside = 0.0
+        for k in range(len(total)):
+            if gained[k] > gained[i]:
+                swings = isinstance(state.terms[k].effect, Backlash | JointElasticity)
+                felt = energy[k].sum(1) if swings else energy[k][:, rows].sum(1)
+                beside += gained[k] * float(where @ felt) / total[k]
         least = max(ACCEPT, (EVENT_SHADOW if once else SHADOW) * beside)
         if isinstance(term.effect, ExternalContact):
             beyond = total[i] * (1 - where.max())
@@ -462,6 +467,8 @@ def ranked(
     for p in scanned:
         name = p.key[0]
         usual = USUAL.get(name, 0.0)
+        if isinstance(p.effect, PayloadChange) and p.effect.form == "carried":
+            usual = USUAL["external_contact"]  # any push may look like a body held for a while
         if name in _RICHER:
             usual = min(usual, -RICHER_SHARE * p.evidence)
         p = dataclasses.replace(p, evidence=p.evidence - np.log(many[name]) + usual)
@@ -654,11 +661,11 @@ def within(problem: Problem, effect: AbstractEffect) -> AbstractEffect:
     if isinstance(effect, ExternalContact) and effect.stop - effect.start < BIN:
         middle = 0.5 * (float(effect.start) + float(effect.stop))
         return dataclasses.replace(effect, start=middle - 0.5 * BIN, stop=middle + 0.5 * BIN)
-    if not isinstance(effect, PayloadChange) or effect.form != "gained":
+    if not isinstance(effect, PayloadChange):
         return effect
     time = next(t.motion.time for t in problem.traces if t.name == effect.recording)
-    start = float(np.clip(effect.start, time[0] + 3 * BIN, time[-1] - 3 * BIN))
-    return dataclasses.replace(effect, start=start)
+    inside = lambda at: at if abs(at) >= EVER else float(np.clip(at, time[0] + 3 * BIN, time[-1] - 3 * BIN))
+    return dataclasses.replace(effect, start=inside(float(effect.start)), stop=inside(float(effect.stop)))
 
 
 def moved(effect: AbstractEffect, move: Float[np.ndarray, " shapes"]) -> AbstractEffect:

@@ -42,9 +42,10 @@ def _as_body(
     effect: AbstractArmEffect,
     directions: Float[np.ndarray, "10 10"],
     c: Float[np.ndarray, " n"],
-    covariance: Float[np.ndarray, "n n"],
+    covariance: Float[np.ndarray, "all all"],
 ) -> list[dict[str, Any]]:
     """Standard parameters of the body, about the link's frame; its centre of mass where it has a mass."""
+    covariance = covariance[: len(c), : len(c)]
     phi, deviation = directions @ c, np.sqrt(np.maximum(np.diag(directions @ covariance @ directions.T), 0))
     names = ("mass", *_MOMENTS, *_INERTIAS)
     units = ("kg", *("kg·m",) * 3, *("kg·m²",) * 6)
@@ -162,11 +163,11 @@ class Payload(AbstractArmEffect):
 class PayloadChange(AbstractArmEffect):
     r"""A body at the flange, gained or lost at $t_0$ during a recording: $\tau = H(t - t_0)\,Y_n\,\phi$.
 
-    Form "gained": there from `start` on. Form "lost": there until `start`; the model is without it.
+    Form "gained": there from `start` on. Form "lost": there until `stop`. Form "carried": from `start` to `stop`.
+    The model is without it.
     """
 
     name: ClassVar[str] = "payload_change"
-    shapes: ClassVar[tuple[Shape, ...]] = (Shape("start", "s", -np.inf, np.inf, False),)
     reveals: ClassVar[str] = "the same poses before and after"
     confounded_with: ClassVar[tuple[str, ...]] = ("external_contact", "torque_drift")
     bound_to_recording: ClassVar[bool] = True
@@ -178,6 +179,11 @@ class PayloadChange(AbstractArmEffect):
     recording: str = eqx.field(static=True)
     form: str = eqx.field(static=True)
 
+    @property
+    def shapes(self) -> tuple[Shape, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        names = {"gained": ("start",), "lost": ("stop",), "carried": ("start", "stop")}[self.form]
+        return tuple(Shape(name, "s", -np.inf, np.inf, False) for name in names)
+
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["PayloadChange"]:
         return []  # the event scan proposes them
@@ -186,7 +192,7 @@ class PayloadChange(AbstractArmEffect):
         """A body gained stays for what is recorded later, one lost was there before."""
         if recording == self.recording:
             return self
-        there = later is not None and later == (self.form == "gained")
+        there = later is not None and self.form == ("gained" if later else "lost")
         return dataclasses.replace(self, start=-EVER, stop=EVER) if there else None
 
     @property
@@ -203,7 +209,7 @@ class PayloadChange(AbstractArmEffect):
 
     @property
     def equation(self) -> str:
-        when = {"gained": "t >= start", "lost": "t < start", "carried": "start <= t < stop"}[self.form]
+        when = {"gained": "t >= start", "lost": "t < stop", "carried": "start <= t < stop"}[self.form]
         return f"tau = Y_{self.link + 1}(q, dq, ddq) * (ten inertial parameters of the body) while {when}"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
@@ -225,8 +231,7 @@ class PayloadChange(AbstractArmEffect):
         return Resistance(rnea(arm.chain, phi, q, qd, qdd) * gone, jnp.zeros_like(q), z)
 
     def parameters(self, c, covariance) -> list[dict[str, Any]]:
-        joint = self.joints[0] + 1
-        when = [{"name": "start", "joint": joint, "value": float(self.start), "std": None, "unit": "s"}]
+        when = super().parameters(c, covariance)[len(c) :]
         return _as_body(self, self._basis[0], c, covariance) + when
 
 
