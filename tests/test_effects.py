@@ -25,7 +25,7 @@ from jaxpanda.effects.drive import Backlash, JointElasticity, TorqueRipple
 from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.load import GravityDirection, InertialParameters, Payload, PayloadChange
 from jaxpanda.effects.memory import PreslidingHysteresis
-from jaxpanda.effects.sensing import EncoderOffset, TimeDelay
+from jaxpanda.effects.sensing import EncoderOffset, TimeDelay, TorqueDrift
 from jaxpanda.effects.twist import Law, twist_torque
 from jaxpanda.effects.unknown import Unknown
 
@@ -103,8 +103,10 @@ def test_every_effect_reads_back_from_its_json_and_says_its_parameters(arm, moti
         again = effect_from_json(effect.to_json())
         np.testing.assert_array_equal(columns(again, motion, channels), columns(effect, motion, channels))
         n = len(effect.coefficients)
-        parameters = effect.parameters(np.ones(n), np.eye(n))
-        assert {"name", "joint", "value", "std", "unit"} == set(parameters[0])
+        parameters = effect.parameters(np.ones(n), np.eye(n + sum(not s.pivot for s in effect.shapes)))
+        for parameter in parameters:
+            assert {"name", "joint", "value", "std", "unit"} == set(parameter)
+            assert 0 <= parameter["std"] < np.inf
         assert effect.equation
 
 
@@ -331,3 +333,12 @@ def test_shapes_evaluated_together_are_those_evaluated_alone(arm, motion):
 def test_a_gear_that_stiffens_twists_less(motion):
     soft, stiff = (JointElasticity(1, 400.0, 0.3, s).over(motion)[..., 0] for s in (0.0, 1e-3))
     assert np.sqrt(np.mean(stiff**2)) < 0.9 * np.sqrt(np.mean(soft**2))
+
+
+def test_a_bias_that_wandered_returns_to_its_mean_after_what_was_recorded():
+    effect = TorqueDrift(0, 9.0, "wandering", until=20.0)
+    c, none = np.array([0.01, 0.3, 0.2, -0.4, 0.1, 0.2]), np.zeros(7)
+    bias = lambda t: float(effect.at(Channels(jnp.asarray(t), none, none, none, none, none)) @ c)
+    mean = np.mean([bias(t) for t in np.linspace(0, 20, 2001)])
+    assert bias(20.0 + 1e-9) == pytest.approx(bias(20.0), abs=1e-6)
+    assert bias(100.0) == pytest.approx(mean, abs=1e-3)

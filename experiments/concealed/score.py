@@ -48,6 +48,25 @@ TARGETS = {
 }
 
 
+# Where truth and answer have a number of the same meaning: name in the truth, name in the answer, and what of the
+# answer's value is the truth's.
+SAME = {
+    "viscous_friction": [("damping", "damping", lambda x: x)],
+    "coulomb_friction": [("coulomb", "coulomb", lambda x: x)],
+    "armature": [("armature", "armature", lambda x: x)],
+    "torque_offset": [("offset", "offset", lambda x: x)],
+    "torque_gain": [("gain", "gain_error", lambda x: 1 + x)],
+    "torque_ripple": [("order", "order", lambda x: x)],
+    "encoder_offset": [("offset", "offset", lambda x: x)],
+    "time_delay": [("delay", "delay", lambda x: x)],
+    "joint_elasticity": [("stiffness", "stiffness", lambda x: x)],
+    "backlash": [("gap", "half_width", lambda x: 2 * x)],
+    "payload": [("mass", "mass", lambda x: x)],
+    "payload_change": [("mass", "mass", lambda x: x)],
+    "external_contact": [("force", "force", lambda x: x)],
+}
+
+
 # -------------------------------------------------------------------------------- running the tool
 
 
@@ -134,6 +153,20 @@ def interval_overlap(entry, finding):
     return overlap(entry["intervals"], finding["intervals"])
 
 
+def deviations(entry, finding):
+    """How many standard deviations the answer's numbers are from the truth's, where they mean the same."""
+    found = []
+    for name, called, truth_of in SAME.get(entry["effect"], []):
+        for told in (p for p in entry["parameters"] if p["name"] == name):
+            ours = [p for p in finding["parameters"] if p["name"] == called]
+            if len(ours) > 1:
+                ours = [p for p in ours if p["joint"] == told["joint"]]
+            for p in ours[:1]:
+                std = abs(truth_of(p["value"] + p["std"]) - truth_of(p["value"]))
+                found.append((truth_of(p["value"]) - told["value"]) / max(std, 1e-12))
+    return found
+
+
 def gap_closed(truth, case, predicted):
     """Share of the way from the user's simulation to the true model, in squared error over noise.
 
@@ -197,6 +230,13 @@ def judge(case, out):
         interval_overlap(entry, next((f for f in findings if f["effect"] == entry["effect"]), None))
         for entry in effects
         if entry["intervals"] is not None
+    ]
+    result["deviations"] = [
+        [entry["effect"], z]
+        for entry in effects
+        for finding in findings
+        if finding["effect"] == entry["effect"]
+        for z in deviations(entry, finding)
     ]
     return result
 
@@ -264,6 +304,8 @@ def figures(results):
     table["gap closed, negative"] = (_mean([x < 0 for x in closed]), len(closed))
     harm = [r["harm"] for r in results if "harm" in r]
     table["any joint > 10 % worse than nominal"] = (_mean([h > 1.1 for h in harm]), len(harm))
+    off = [abs(z) for r in results for _, z in r["deviations"]]
+    table["truth within 95 % interval"] = (_mean([z < 1.96 for z in off]), len(off))
     sure = [(r["confidence"][0] - r["first_right"]) ** 2 for r in results if r["answer"]]
     table["Brier score"] = (_mean(sure), len(sure))
     seconds = [r["seconds"] for r in results]

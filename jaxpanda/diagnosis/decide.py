@@ -7,14 +7,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import scipy.ndimage
 import scipy.special
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..effects import CATALOGUE, AbstractEffect
+from ..effects.contact import ExternalContact
 from ..effects.friction import CoulombFriction
+from ..effects.load import PayloadChange
 from ..effects.memory import PreslidingHysteresis
 from .problem import Problem, Term
-from .search import ACCEPT, State, instead, leftover, shares, without
+from .search import ACCEPT, State, instead, leftover, places, shares, without
+from .uncertainty import covariances
 
 TEMPERATURE, RELATIVE_TEMPERATURE = 3.0, 0.0003
 """By which differences of evidence are divided [nats, share of the evidence]: laws are never quite right, so that
@@ -47,6 +51,10 @@ STICKS = 1.5e-3
 """Breakaway distance below which friction with memory is Coulomb's that sticks [rad]: a joint at rest holds any
 load up to the level, which a sign of the velocity cannot say."""
 _WIDER = ("stribeck_friction", "asymmetric_friction", "load_dependent_friction", "friction_drift")
+BEYOND = 4.0
+"""Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""
+_SMOOTHED, _JOINED = 0.1, 0.3
+"""Over which such an error is averaged, and a pause that does not end it [s]."""
 _LISTED = 0.01
 """Probability from which a rival is listed."""
 
@@ -96,8 +104,59 @@ def findings(problem: Problem, state: State) -> list[Finding]:
     names, where = titles(state.terms), shares(state)
     doubt = CROWD ** np.maximum(0.0, crowd(where, names, [r[0] for r in rivals]) - 2)
     doubt = doubt * np.exp(-DOUBT * where @ left)
-    out = [_finding(problem, state, places, names[places[0]], rivals, doubt) for places in groups]
-    return sorted(out, key=lambda f: -f.evidence)
+    spread = covariances(problem, state)
+    out = [_finding(problem, state, group, names[group[0]], rivals, doubt, spread) for group in groups]
+    left_over = unexplained(problem, state) if not out else None
+    return [left_over] if left_over is not None else sorted(out, key=lambda f: -f.evidence)
+
+
+def unexplained(problem: Problem, state: State) -> Finding | None:
+    """The joint that is farthest beyond its noise where nothing was found, and when it is; None if none is."""
+    weights = np.concatenate([t.weights for t in problem.traces])
+    x = state.design.x[: problem.nuisance[0].shape[2]]
+    left = [r - n @ problem.explained(x) for r, n in zip(problem.residual, problem.nuisance, strict=True)]
+    squares = (np.concatenate(left) / state.noise.std) ** 2 * weights**2
+    beyond = squares.sum(0) / np.maximum((weights**2).sum(0), 1.0)
+    joint = int(np.argmax(beyond))
+    if beyond[joint] < BEYOND:
+        return None
+    spans = []
+    for trace, e, on in zip(problem.traces, left, problem.active, strict=True):
+        power = (e[:, joint] / state.noise.std[joint] * trace.weights[:, joint]) ** 2
+        power = scipy.ndimage.uniform_filter1d(power, max(1, round(_SMOOTHED / trace.motion.dt)))
+        spans.append((float(power.sum()) * on, trace, _spans(trace.motion.time, power > BEYOND)))
+    _, trace, when = max(spans, key=lambda span: span[0])
+    whole = sum(b - a for a, b in when) > 0.5 * float(np.ptp(trace.motion.time))
+    rms = np.sqrt(np.mean(np.concatenate(left) ** 2, 0)) * (np.arange(problem.dof) == joint)
+    return Finding(
+        effect="unknown",
+        joints=(joint,),
+        recordings=(trace.name,),
+        intervals=None if whole else when,
+        confidence=float(1 - 1 / beyond[joint]),
+        alternatives=(),
+        equation="no law was found",
+        parameters=(),
+        rms_torque=rms,
+        evidence=float(0.5 * np.sum(weights[:, joint] > 0) * (beyond[joint] - 1 - np.log(beyond[joint]))),
+        summary=f"Joint {joint + 1} is {np.sqrt(beyond[joint]):.1f} times its noise off the simulation"
+        + ("" if whole else f" at times, in {trace.name} first from {when[0][0]:.2f} s to {when[0][1]:.2f} s")
+        + "; neither a named effect nor a free curve explains it.",
+        terms=(),
+    )
+
+
+def _spans(
+    time: Float[np.ndarray, " time"], on: Bool[np.ndarray, " time"]
+) -> tuple[tuple[float, float], ...]:
+    """From when to when, short pauses left out."""
+    out: list[tuple[float, float]] = []
+    for t in time[on]:
+        if out and t - out[-1][1] < _JOINED:
+            out[-1] = out[-1][0], float(t)
+        else:
+            out.append((float(t), float(t)))
+    return tuple(out)
 
 
 def crowd(
@@ -135,15 +194,26 @@ def called(effect: AbstractEffect) -> str:
 
 
 def titles(terms: Sequence[Term]) -> list[str]:
-    """What each term is called beside the others: Coulomb's friction is part of the laws that hold it."""
+    """What each term is called beside the others: Coulomb's friction is part of the laws that hold it, and a body
+    that is held while something pushes is part of the push."""
     out = []
     for term in terms:
         name = called(term.effect)
+        if any(_meets(term.effect, other.effect) for other in terms):
+            name = ExternalContact.name
         if name == CoulombFriction.name:
             beside = [t.effect.name for t in terms if t.effect.joints == term.effect.joints]
             name = next((n for n in _WIDER if n in beside), name)
         out.append(name)
     return out
+
+
+def _meets(body: AbstractEffect, push: AbstractEffect) -> bool:
+    """Whether a body is held for a while in which a contact acts too."""
+    if not (isinstance(body, PayloadChange) and body.form == "carried" and isinstance(push, ExternalContact)):
+        return False
+    apart = body.stop < push.start or push.stop < body.start
+    return body.recording == push.recording and not apart
 
 
 def together(problem: Problem, terms: Sequence[Term]) -> list[list[int]]:
@@ -191,35 +261,31 @@ def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, fl
     return evidence, probability, probability.get(called(term.effect), 0.0)
 
 
-def coefficients(
-    problem: Problem, state: State, i: int
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-    """Coefficients of a term, and their covariance."""
-    before = problem.nuisance[0].shape[2] + sum(len(t.deviation) for t in state.terms[:i])
-    place = slice(before, before + len(state.terms[i].deviation))
-    return state.design.x[place], state.design.covariance[place, place]
+def coefficients(state: State, i: int) -> Float[np.ndarray, " n"]:
+    """Those of a term."""
+    return state.design.x[places(state)[i]]
 
 
-def torque(problem: Problem, state: State, i: int) -> list[Float[np.ndarray, "_time dof"]]:
+def torque(state: State, i: int) -> list[Float[np.ndarray, "_time dof"]]:
     """Torque of a term in each recording [N m]."""
-    c, _ = coefficients(problem, state, i)
-    return [columns @ c for columns in state.terms[i].columns]
+    return [columns @ coefficients(state, i) for columns in state.terms[i].columns]
 
 
 def _finding(
     problem: Problem,
     state: State,
-    places: Sequence[int],
+    members: Sequence[int],
     name: str,
     rivals: Sequence,
     doubt: Float[np.ndarray, " terms"],
+    covariance: Sequence[Float[np.ndarray, "_n _n"]],
 ) -> Finding:
-    terms = [state.terms[i] for i in places]
+    terms = [state.terms[i] for i in members]
     effect = next((t.effect for t in terms if t.effect.name == name), terms[0].effect)
     joints = tuple(sorted({j for t in terms for j in t.effect.joints}))
     if effect.bound_to_recording:  # what happened at once happened at one place
-        joints = terms[int(np.argmax([rivals[i][0] for i in places]))].effect.joints
-    parts = [torque(problem, state, i) for i in places]
+        joints = terms[int(np.argmax([rivals[i][0] for i in members]))].effect.joints
+    parts = [torque(state, i) for i in members]
     together = [np.sum([part[r] for part in parts], 0) for r in range(len(problem.traces))]
     names = [t.name for t, on in zip(problem.traces, problem.active, strict=True) if on]
     intervals = None
@@ -233,12 +299,11 @@ def _finding(
     )
     rms = np.sqrt(np.mean(felt**2, 0)) if len(felt) else np.zeros(problem.dof)
     parameters, equations = [], []
-    for i, term in zip(places, terms, strict=True):
-        c, covariance = coefficients(problem, state, i)
-        parameters += term.effect.parameters(c, covariance)
+    for i, term in zip(members, terms, strict=True):
+        parameters += term.effect.parameters(coefficients(state, i), covariance[i])
         if term.effect.equation not in equations:
             equations.append(term.effect.equation)
-    named = [i for i in places if called(state.terms[i].effect) == name]
+    named = [i for i in members if called(state.terms[i].effect) == name] or list(members)
     clearest = max(named, key=lambda i: rivals[i][0])
     sure = 1.0 if name == "unknown" else float(doubt[clearest])
     own = sure * rivals[clearest][2]
@@ -256,11 +321,11 @@ def _finding(
         equation="; ".join(equations),
         parameters=tuple(parameters),
         rms_torque=rms,
-        evidence=float(sum(rivals[i][0] for i in places)),
+        evidence=float(sum(rivals[i][0] for i in members)),
         summary=_summary(
             name, joints, rms, intervals, names, alternatives, problem, own, "; ".join(equations)
         ),
-        terms=tuple(places),
+        terms=tuple(members),
     )
 
 

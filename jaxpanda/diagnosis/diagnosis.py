@@ -29,6 +29,7 @@ from .premises import Premises, settled
 from .problem import FOLDS, Problem
 from .search import State, transferable
 from .traces import Trace, prepare
+from .uncertainty import polished
 
 CORRECTED = "corrected.json"
 """What `predict` reads."""
@@ -197,6 +198,7 @@ def diagnose(
     log: list[str] = []
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
     problem = premises.problem
+    state = polished(problem, state)
     found = tuple(findings(problem, state))
     kept = transferable(problem, state)
     corrected = _corrected(arm, premises, kept)
@@ -330,7 +332,7 @@ def _corrected(arm: Arm, premises: Premises, state: State) -> Corrected:
     for i, term in enumerate(state.terms):
         drifts = hasattr(term.effect, "until")  # nobody knows how it goes on
         effects.append(dataclasses.replace(term.effect, until=recorded) if drifts else term.effect)
-        values.append(jnp.asarray(coefficients(problem, state, i)[0]))
+        values.append(jnp.asarray(coefficients(state, i)))
     return Corrected(
         arm, jnp.asarray(change), jnp.asarray(damping), jnp.asarray(level), tuple(effects), tuple(values)
     )

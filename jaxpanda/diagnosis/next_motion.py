@@ -184,6 +184,8 @@ def _told(
 def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
     """The finding against each rival that is worth an experiment."""
     rivals = {name: p for name, p in finding.alternatives if p >= WORTH}
+    if not finding.terms:
+        return []
     i = max(finding.terms, key=lambda i: float(np.sum(state.terms[i].columns[0] ** 2)))
     term = state.terms[i]
     if not rivals or term.effect.bound_to_recording:
@@ -199,7 +201,7 @@ def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
         name = p.effect.name
         if name in rivals and (name not in best or p.evidence > best[name].evidence):
             best[name] = p
-    a = _Side(term.effect, coefficients(problem, state, i)[0], _shapes(problem, term.effect))
+    a = _Side(term.effect, coefficients(state, i), _shapes(problem, term.effect))
     out = []
     for name, p in best.items():
         more = problem.design((*others, problem.term(p.effect, p.deviation)), state.noise)

@@ -108,10 +108,8 @@ def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -
     tables = []
     rows = []
     for p in one.parameters:
-        std = p.get("std")
-        interval = (
-            "–" if std is None else f"{number(p['value'] - 1.96 * std)} … {number(p['value'] + 1.96 * std)}"
-        )
+        ends = [number(p["value"] + side * 1.96 * p["std"]) for side in (-1, 1)]
+        interval = " … ".join(ends) if p["std"] else "–"
         rows.append([p["name"], str(p["joint"]), number(p["value"]), interval, p["unit"]])
     if rows:
         tables.append(Table(["parameter", "joint", "value", "95 % interval", "unit"], rows))
@@ -149,25 +147,28 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
     """The residual without everything but this finding, against what drives it, and over time."""
     problem, state = found.problem, found.state
     joint = int(np.argmax(one.rms_torque))
-    effect = state.terms[one.terms[0]].effect
+    effect = state.terms[one.terms[0]].effect if one.terms else None
     for i in one.terms:  # the term that acts where most is felt
         if joint in state.terms[i].effect.joints:
             effect = state.terms[i].effect
     own = [
-        sum(t.columns[r] @ coefficients(problem, state, i)[0] for i, t in _terms(found, one))
-        for r in range(len(problem.traces))
+        sum((t.columns[r] @ coefficients(state, i) for i, t in _terms(found, one)), np.zeros_like(residual))
+        for r, residual in enumerate(problem.residual)
     ]
     _, _, after = zip(*((n, b, a) for n, _, b, a in found.residuals()), strict=True)
     rows = [np.flatnonzero(t.weight * on > 0) for t, on in zip(problem.traces, problem.active, strict=True)]
     fits = [np.asarray(f)[k, joint] for f, k in zip(own, rows, strict=True)]
     lefts = [a[k, joint] + f for a, k, f in zip(after, rows, fits, strict=True)]
-    against = _AGAINST.get(one.effect, "time")
-    label, x, turned = _regime(found, effect, joint, against if one.effect != "unknown" else _of(effect))
+    against = "time" if effect is None else _AGAINST.get(one.effect, "time")
+    if effect is not None and one.effect == "unknown":
+        against = _of(effect)
+    label, x, turned = _regime(found, effect, joint, against)
     signs = [s[k] for s, k in zip(turned, rows, strict=True)]
     xs = np.concatenate([v[k] for v, k in zip(x, rows, strict=True)])
     y = np.concatenate([r * s for r, s in zip(lefts, signs, strict=True)])
     f = np.concatenate([r * s for r, s in zip(fits, signs, strict=True)])
-    shown = int(np.argmax([np.sum(v**2) for v in fits]))
+    named = [t.name for t in problem.traces].index(one.recordings[0])
+    shown = int(np.argmax([np.sum(v**2) for v in fits])) if one.terms else named
     trace = problem.traces[shown]
     delayed = one.effect == "time_delay"
     ordered = one.effect == "torque_ripple"
@@ -229,7 +230,7 @@ def _of(effect: AbstractEffect) -> str:
     }.get(form, "time")
 
 
-def _regime(found: Diagnosis, effect: AbstractEffect, joint: int, against: str):
+def _regime(found: Diagnosis, effect: AbstractEffect | None, joint: int, against: str):
     """A label, the variable in each recording, and by which sign the residual is turned."""
     traces = found.problem.traces
     source = int(getattr(effect, "source", joint))

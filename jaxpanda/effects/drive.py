@@ -168,7 +168,7 @@ class JointElasticity(AbstractArmEffect):
     name: ClassVar[str] = "joint_elasticity"
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
     shapes: ClassVar[tuple[Shape, ...]] = (
-        Shape("stiffness", "N·m/rad", 50.0, 1e6),
+        Shape("stiffness", "N·m/rad", 50.0, 1e6, pivot=True),
         Shape("damping_ratio", "1", 0.02, 1.5),
     )
     reveals: ClassVar[str] = (
@@ -212,6 +212,14 @@ class JointElasticity(AbstractArmEffect):
     def equation(self) -> str:
         more = " * (1 + stiffening * (stiffness * x)^2)" if float(self.stiffening) else ""
         return f"q_link = q + x, M_jj * ddx + tau(q + x) = -stiffness * x{more} - damping * dx"
+
+    def parameters(self, c, covariance) -> list[dict[str, Any]]:
+        joint, deviation = int(self.joint) + 1, float(np.sqrt(max(covariance[0, 0], 0.0)))
+        told = super().parameters(c, covariance)
+        if c[0] > 0:
+            value = {"name": "stiffness", "value": float(1 / c[0]), "std": float(deviation / c[0] ** 2)}
+            told.append({**value, "joint": joint, "unit": "N·m/rad"})
+        return told
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         return self.over_many([self], motion)[:, :, 0]
@@ -275,7 +283,7 @@ class Backlash(AbstractArmEffect):
     name: ClassVar[str] = "backlash"
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
     shapes: ClassVar[tuple[Shape, ...]] = (
-        Shape("half_width", "rad", 2e-4, 0.1),
+        Shape("half_width", "rad", 2e-4, 0.1, pivot=True),
         Shape("stop_stiffness", "N·m/rad", 2000.0, 1e5),
     )
     reveals: ClassVar[str] = "slow motion through poses where the load changes sign"
@@ -305,7 +313,7 @@ class Backlash(AbstractArmEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return tuple(Coefficient(name, "rad", sign=1, scale=0.02) for name in ("lost_motion", "impact"))
+        return tuple(Coefficient(name, "rad", sign=1, scale=0.02) for name in ("half_width", "impact"))
 
     @property
     def equation(self) -> str:

@@ -49,6 +49,8 @@ class Shape:
     lower: float
     upper: float
     logarithmic: bool = True
+    pivot: bool = False
+    """Whether columns are linearised about it: the first coefficient says the same, and is the unknown."""
 
 
 class Resistance(eqx.Module):
@@ -118,18 +120,25 @@ class AbstractEffect(eqx.Module):
         return self
 
     def parameters(
-        self, c: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]
+        self, c: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "all all"]
     ) -> list[dict[str, Any]]:
-        """Parameters as people know them: name, 1-based joint, value, std, unit."""
+        """Parameters as people know them: name, 1-based joint, value, std, unit.
+
+        `covariance` is that of the coefficients and, after them, of the shapes; of pivots there is none, and they
+        are not told.
+        """
         joint = self.joints[0] + 1 if self.joints else None
         deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         out = [
             {"name": k.name, "joint": joint, "value": float(v), "std": float(s), "unit": k.unit}
-            for k, v, s in zip(self.coefficients, c, deviation, strict=True)
+            for k, v, s in zip(self.coefficients, c, deviation[: len(c)], strict=True)
         ]
-        for shape in self.shapes:
+        unknown = [shape for shape in self.shapes if not shape.pivot]
+        for shape, s in zip(unknown, deviation[len(c) :], strict=True):
             value = float(getattr(self, shape.name))
-            out.append({"name": shape.name, "joint": joint, "value": value, "std": None, "unit": shape.unit})
+            out.append(
+                {"name": shape.name, "joint": joint, "value": value, "std": float(s), "unit": shape.unit}
+            )
         return out
 
     def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:

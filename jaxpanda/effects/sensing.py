@@ -94,6 +94,7 @@ class TorqueDrift(AbstractInstantEffect):
     A long time constant is a linear trend; what it came to is held after `until` [s], the end of what was
     recorded. Form "extra" is without the constant; "wave" is
     $a\,t + b + s \sin(2\pi t/T) + c \cos(2\pi t/T)$, a bias that wanders; "wandering" adds half the period to it.
+    What wanders goes on to nobody knows where: after `until` it returns to its mean within $T/2\pi$.
     """
 
     name: ClassVar[str] = "torque_drift"
@@ -138,9 +139,13 @@ class TorqueDrift(AbstractInstantEffect):
         t = jnp.minimum(s.t, self.until)
         one, phase = jnp.ones_like(t), t / self.time_constant
         if self.form in ("wave", "wandering"):
-            w = 2 * jnp.pi * phase
-            wave = [t, one, jnp.sin(w), jnp.cos(w)]
-            return jnp.stack(wave if self.form == "wave" else [*wave, jnp.sin(2 * w), jnp.cos(2 * w)])
+            w = 2 * jnp.pi / self.time_constant
+            waves = (w,) if self.form == "wave" else (w, 2 * w)
+            now = [t, one, *(f(k * t) for k in waves for f in (jnp.sin, jnp.cos))]
+            ends = [k * self.until for k in waves]
+            means = [m for x in ends for m in ((1 - jnp.cos(x)) / x, jnp.sin(x) / x)]
+            mean = jnp.stack([0.5 * self.until * one, one, *means])
+            return mean + (jnp.stack(now) - mean) * jnp.exp(-w * jnp.maximum(s.t - self.until, 0.0))
         g = -jnp.expm1(-phase)
         return jnp.stack([g] if self.form == "extra" else [g, one])
 
@@ -191,11 +196,12 @@ class TorqueCrosstalk(AbstractInstantEffect):
 class EncoderOffset(AbstractArmEffect):
     r"""Constant bias of a position sensor, $\tau(q + \Delta q_j) - \tau(q)$.
 
-    Columns are $(\tau(q + a) - \tau(q))/a$ of the nominal torque, so that the coefficient is the offset near a.
+    Columns are $(\tau(q + a) - \tau(q))/a$ of the nominal torque, so that the coefficient is $\Delta q_j$ near a.
+    What is told is the sensor's bias, $-\Delta q_j$.
     """
 
     name: ClassVar[str] = "encoder_offset"
-    shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "rad", -0.6, 0.6, False),)
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "rad", -0.6, 0.6, False, pivot=True),)
     reveals: ClassVar[str] = "the joint at rest over its range; with and without payload"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction", "joint_spring")
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
@@ -217,7 +223,7 @@ class EncoderOffset(AbstractArmEffect):
 
     @property
     def equation(self) -> str:
-        return "q_true = q_measured + offset"
+        return "q_measured = q_true + offset"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         a = np.copysign(max(abs(self.around), 1e-4), self.around)
@@ -229,7 +235,8 @@ class EncoderOffset(AbstractArmEffect):
         return jnp.zeros_like(s.q).at[self.joint].set(-c[0]), z
 
     def parameters(self, c, covariance):
-        return super().parameters(c, covariance)[:1]
+        (offset,) = super().parameters(c, covariance)
+        return [{**offset, "value": -offset["value"]}]
 
 
 class TimeDelay(AbstractArmEffect):
@@ -243,7 +250,7 @@ class TimeDelay(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "time_delay"
-    shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "s", 1e-4, 0.2),)
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "s", 1e-4, 0.2, pivot=True),)
     reveals: ClassVar[str] = "fast reversals"
     confounded_with: ClassVar[tuple[str, ...]] = (
         "viscous_friction",
@@ -289,8 +296,8 @@ class TimeDelay(AbstractArmEffect):
         return _shifted(t, tau, c[0])
 
     def parameters(self, c, covariance):
-        std = float(np.sqrt(max(covariance[0, 0], 0.0)))
-        return [{"name": "delay", "joint": None, "value": float(c[0]), "std": std, "unit": "s"}]
+        (delay,) = super().parameters(c, covariance)
+        return [{**delay, "joint": None}]
 
 
 def _shifted(t: Array, x: Float[Array, "time dof"], by: Array) -> Float[Array, "time dof"]:

@@ -115,7 +115,7 @@ class Unknown(AbstractInstantEffect):
                 "name": f"knot_{k + 1}",
                 "joint": int(self.joint) + 1,
                 "value": float(x),
-                "std": None,
+                "std": 0.0,
                 "unit": "-",
             }
             for k, x in enumerate(np.asarray(self.knots))

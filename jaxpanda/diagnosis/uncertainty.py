@@ -1,0 +1,180 @@
+r"""How sure the parameters of the terms are, nonlinear ones included.
+
+A term's torque is $X(\theta)\,c$: linear in its coefficients c, not in its shape $\theta$. Near the optimum it is
+linear in both, with columns $[X,\ \partial X/\partial\theta\; c]$, so that all coefficients and shapes of all
+terms have one covariance, beside what a refit of the model may absorb. Two are made:
+
+- $H^{-1} (A^\top \Sigma A + P)\, H^{-1}$ with the whitened columns A, the prior's precision P, $H = A^\top A + P$
+  and the covariance $\Sigma$ of what the model leaves, as autoregressive noise. It is not 1: the noise that the
+  search weighs by is what a saturated model leaves, which takes slow noise for structure.
+- The delete-a-block jackknife's, which asks the data how far the parameters move without a stretch of time. It
+  needs no model of the noise and allows for a wrong one of the arm, but cannot see what happened in one stretch
+  only. `jaxpanda.identification.statistics` has its formula and source.
+
+Each parameter takes the larger deviation of the two; correlations are the first one's.
+"""
+
+import dataclasses
+import itertools
+
+import numpy as np
+from jaxtyping import Float
+from scipy.signal import lfilter
+
+from ..effects import AbstractEffect
+from .evidence import Design
+from .noise import autoregression
+from .problem import Problem, Term
+from .search import State, first_steps, moved, places, within
+
+BLOCKS = 20
+"""Blocks of the jackknife."""
+_STEP_LOG, _STEP_SHARE, _STEP_TIME = 0.02, 0.002, 0.01
+"""Steps of the differences: of a logarithm, as a share of the bounds, and of an instant [s]."""
+_POLISHED, _ENOUGH = 5, 0.01
+"""Steps towards the optimum at most, and the evidence below which another is not worth it [nats]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Linearised:
+    """The model near its optimum: its design with a column for every shape, and which those are."""
+
+    design: Design
+    shapes: tuple[tuple[int, int], ...]
+    """Term and place among its shapes, in the order of the last columns."""
+
+
+def linearised(problem: Problem, state: State) -> Linearised:
+    """Every shape that is an unknown of its own beside all coefficients."""
+    duration = sum(float(np.ptp(t.motion.time)) for t in problem.traces)
+    tangents, owners = [], []
+    for i, (term, place) in enumerate(zip(state.terms, places(state), strict=True)):
+        for k, shape in enumerate(term.effect.shapes):
+            if not shape.pivot:
+                slope, deviation = _tangent(problem, term.effect, k, state.design.x[place], duration)
+                tangents.append(Term(term.effect, slope, np.array([deviation])))
+                owners.append((i, k))
+    return Linearised(problem.design((*state.terms, *tangents), state.noise), tuple(owners))
+
+
+def polished(problem: Problem, state: State) -> State:
+    """Shapes moved to the optimum by Gauss-Newton steps, all at once, as long as the recordings get likelier."""
+    for _ in range(_POLISHED):
+        near = linearised(problem, state)
+        step = _step(state, near)
+        for share in (1.0, 0.3, 0.1):
+            tried = _moved(problem, state, near, share * step)
+            gained = tried.design.log_evidence - state.design.log_evidence
+            if gained > 0:
+                break
+        else:
+            return state
+        state = tried
+        if gained < _ENOUGH:
+            return state
+    return state
+
+
+def _step(state: State, near: Linearised) -> Float[np.ndarray, " shapes"]:
+    """Of the shapes; one that is at a bound and would leave it stays, and the others move beside it."""
+    H, g = near.design.information, near.design.g
+    first = len(g) - len(near.shapes)
+    free = np.ones(len(g), bool)
+    while True:
+        x = np.zeros(len(g))
+        x[free] = np.linalg.solve(H[np.ix_(free, free)], g[free]) if free.any() else 0.0
+        stuck = []
+        for n, (i, k) in enumerate(near.shapes, first):
+            effect, shape = state.terms[i].effect, state.terms[i].effect.shapes[k]
+            value = float(getattr(effect, shape.name))
+            if (value <= shape.lower and x[n] < 0) or (value >= shape.upper and x[n] > 0):
+                stuck.append(n)
+        if not stuck:
+            return x[first:]
+        free[stuck] = False
+
+
+def _moved(problem: Problem, state: State, near: Linearised, step: Float[np.ndarray, " shapes"]) -> State:
+    """With the shapes a step further, none by more than a refinement's first."""
+    steps = {i: np.zeros(len(state.terms[i].effect.shapes)) for i, _ in near.shapes}
+    for (i, k), value in zip(near.shapes, step, strict=True):
+        most = first_steps(state.terms[i].effect)[k]
+        steps[i][k] = np.clip(value, -most, most)
+    terms = [
+        problem.term(within(problem, moved(t.effect, steps[i])), t.deviation) if i in steps else t
+        for i, t in enumerate(state.terms)
+    ]
+    return State(tuple(terms), state.noise, problem.design(terms, state.noise))
+
+
+def covariances(problem: Problem, state: State) -> list[Float[np.ndarray, "n n"]]:
+    """Covariance of each term's coefficients and, after them, of those shapes that are no pivots."""
+    if not state.terms:
+        return []
+    near = linearised(problem, state)
+    C = _under_noise(near.design)
+    ratio = np.sqrt(np.maximum(_jackknife(near.design) / np.maximum(np.diag(C), 1e-300), 1.0))
+    C = ratio[:, None] * C * ratio
+    first = len(C) - len(near.shapes)
+    out = []
+    for i, (term, place) in enumerate(zip(state.terms, places(state), strict=True)):
+        shapes, c = term.effect.shapes, state.design.x[place]
+        own = {k: first + n for n, (owner, k) in enumerate(near.shapes) if owner == i}
+        at = [*range(place.start, place.stop), *own.values()]
+        unit = [float(getattr(term.effect, shapes[k].name)) if shapes[k].logarithmic else 1.0 for k in own]
+        scale = np.array([1.0] * len(c) + unit)
+        out.append(scale[:, None] * C[np.ix_(at, at)] * scale)
+    return out
+
+
+def _tangent(
+    problem: Problem, effect: AbstractEffect, k: int, c: Float[np.ndarray, " n"], duration: float
+) -> tuple[tuple[Float[np.ndarray, "_time dof 1"], ...], float]:
+    """Derivative of a term's torque by a shape or its logarithm; the shape's deviation, were it uniform."""
+    shape = effect.shapes[k]
+    value = float(getattr(effect, shape.name))
+    if shape.logarithmic:
+        step, wide = _STEP_LOG, float(np.log(shape.upper / shape.lower))
+    elif np.isfinite(shape.upper - shape.lower):
+        wide = shape.upper - shape.lower
+        step = _STEP_SHARE * wide
+    else:
+        step, wide = _STEP_TIME, duration
+    unit = np.eye(len(effect.shapes))[k]
+    ends = [moved(effect, sign * step * unit) for sign in (-1.0, 1.0)]
+    reached = [float(getattr(e, shape.name)) for e in ends]
+    width = float(np.log(reached[1] / reached[0])) if shape.logarithmic else reached[1] - reached[0]
+    low, high = (problem.full_columns([e]) for e in ends)
+    assert width > 0, (shape, value)
+    slopes = tuple(((b - a) @ c / width)[:, :, None] for a, b in zip(low, high, strict=True))
+    return slopes, wide / np.sqrt(12)
+
+
+def _under_noise(design: Design) -> Float[np.ndarray, "n n"]:
+    """Covariance of the unknowns under noise like what the model leaves."""
+    meat = np.diag(design.precision)
+    for A, left in zip(design.columns, design.left, strict=True):
+        if np.any(left):
+            a, sigma, _ = autoregression([left], 0)
+            # A^T Sigma A is the square of the columns run backwards through the noise's own filter
+            coloured = np.asarray(lfilter([sigma], np.concatenate([[1.0], -a]), A[::-1], axis=0))
+            meat = meat + coloured.T @ coloured
+    half = design.solve(meat)
+    return design.solve(np.swapaxes(half, 0, 1))
+
+
+def _jackknife(design: Design) -> Float[np.ndarray, " n"]:
+    """Variance of each unknown, by leaving out one block of time after another."""
+    rows = len(design.residual[0])
+    edges = np.linspace(0, rows, BLOCKS + 1).round().astype(int)
+    H = design.information
+    unit = 1 / np.sqrt(np.diag(H))
+    less, scores = np.zeros((BLOCKS, *H.shape)), np.zeros((BLOCKS, len(H)))
+    for A, left in zip(design.columns, design.left, strict=True):
+        for b, (first, last) in enumerate(itertools.pairwise(edges)):
+            part = A[first:last] * unit
+            less[b] += part.T @ part
+            scores[b] += part.T @ left[first:last]
+    moves = -np.linalg.solve(unit[:, None] * H * unit - less, scores[:, :, None])[:, :, 0] * unit
+    moves -= moves.mean(0)
+    return (BLOCKS - 1) / BLOCKS * np.sum(moves**2, 0)

@@ -1,0 +1,82 @@
+"""Deviations of what a diagnosis fits: they hold the truth as often as they say, shapes included."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from jaxpanda import Arm, Recording
+from jaxpanda.diagnosis.events import Proposal
+from jaxpanda.diagnosis.premises import pose
+from jaxpanda.diagnosis.search import first_steps, places, refine, score, start, with_terms
+from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.diagnosis.uncertainty import covariances, polished
+from jaxpanda.effects import AbstractEffect, Motion
+from jaxpanda.effects.drive import TorqueRipple
+from jaxpanda.effects.friction import StribeckFriction
+
+ARM = Arm.panda()
+NOISE, CORRELATED = 0.05, 0.9
+COULOMB, EXCESS, VELOCITY = 0.2, 0.25, 0.1
+AMPLITUDE, ORDER = 0.1, 101.0
+
+
+def recording(seed: int, law) -> Recording:
+    """One motion of the Panda with correlated noise of its own draw; `law` acts in the fifth joint."""
+    rng = np.random.default_rng(7)
+    t = np.arange(0, 10, 0.005)
+    w = 2 * np.pi * np.array([0.1, 0.2, 0.4])[:, None]
+    a, b = rng.normal(0, 0.12, (2, 3, 7))
+    q = 0.5 * np.asarray(ARM.lower + ARM.upper) + np.sin(w * t).T @ a + np.cos(w * t).T @ b
+    qd = (w * np.cos(w * t)).T @ a - (w * np.sin(w * t)).T @ b
+    qdd = -(w**2 * np.sin(w * t)).T @ a - (w**2 * np.cos(w * t)).T @ b
+    rng = np.random.default_rng(1000 + seed)
+    slow = lfilter([np.sqrt(1 - CORRELATED**2)], [1, -CORRELATED], rng.normal(size=q.shape), axis=0)
+    noise = NOISE * np.sqrt(0.5) * (slow + rng.normal(size=q.shape))
+    tau = Motion(ARM, t, q, qd, qdd, np.zeros_like(q)).load + noise
+    tau[:, 4] += law(q[:, 4], qd[:, 4])
+    return Recording("motion.csv", t, q + 1e-5 * rng.normal(size=q.shape), qd=qd, tau=tau)
+
+
+def stribeck(q, qd):
+    return np.sign(qd) * (COULOMB + EXCESS * np.exp(-np.abs(qd / VELOCITY)))
+
+
+def ripple(q, qd):
+    return AMPLITUDE * np.sin(ORDER * q)
+
+
+def fitted(seed: int, law, effect: AbstractEffect) -> dict[str, tuple[float, float]]:
+    """Value and deviation of each parameter, the effect's shape sought from near the truth."""
+    problem = pose((prepare(recording(seed, law), ARM),), (True,), "exact").problem
+    nothing = start(problem)
+    value, deviation = score(problem, nothing.design, nothing.noise, [effect])
+    first = Proposal(effect, float(value[0]), float(value[0]), deviation[0], first_steps(effect))
+    best = refine(problem, nothing.design, nothing.noise, first)
+    state = polished(problem, with_terms(problem, [problem.term(best.effect, best.deviation)]))
+    c = state.design.x[places(state)[0]]
+    told = state.terms[0].effect.parameters(c, covariances(problem, state)[0])
+    return {p["name"]: (p["value"], p["std"]) for p in told}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("law", "effect", "truth"),
+    [
+        (
+            stribeck,
+            StribeckFriction(4, 0.1, 0.002, 1.0, "whole"),
+            {"coulomb": COULOMB, "static_excess": EXCESS, "stribeck_velocity": VELOCITY},
+        ),
+        (ripple, TorqueRipple(4, ORDER, "one"), {"sine": AMPLITUDE, "order": ORDER}),
+    ],
+    ids=["stribeck", "ripple"],
+)
+def test_the_interval_of_a_parameter_holds_the_truth_as_often_as_it_says(law, effect, truth):
+    draws = [fitted(seed, law, effect) for seed in range(24)]
+    for name, true in truth.items():
+        # in logarithms, in which positive numbers spread evenly about their estimate
+        off = np.array([np.log(d[name][0] / true) * d[name][0] / d[name][1] for d in draws])
+        held = np.mean(np.abs(off) < 1.96)
+        # 95 % of 24 draws, give or take; much too wide would be no better
+        assert held >= 0.8, (name, off)
+        assert off.std() > 0.4, (name, off)
