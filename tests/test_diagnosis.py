@@ -18,7 +18,7 @@ from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
 from jaxpanda.diagnosis.decide import called, titles
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
-from jaxpanda.diagnosis.knowledge import check
+from jaxpanda.diagnosis.knowledge import check, inertial_spread
 from jaxpanda.diagnosis.noise import autoregression
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
@@ -374,3 +374,48 @@ def test_a_roughly_known_arm_raises_no_alarm_and_its_friction_is_named():
     rubbing = at_joint(5, lambda t, q, qd, qdd: 0.3 * np.tanh(qd[:, 4] / 0.005))
     result = diagnose(None, [record(2, rubbing, arm=arm), record(3, rubbing, arm=arm)], knowledge="rough")
     assert [(f.effect, f.joints) for f in result.findings] == [("coulomb_friction", (4,))]
+
+
+def test_a_joint_far_beyond_its_noise_is_unknown_though_nothing_explains_it():
+    """A torque sensor that freezes now and then."""
+
+    def frozen(t, q, qd, qdd):
+        torque = Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)).load[:, 3]
+        held = torque.copy()
+        for first in (250, 700, 1250):
+            held[first : first + 130] = torque[first]
+        return (held - torque)[:, None] * np.eye(7)[3]
+
+    result = diagnose(None, [record(30, frozen)])
+    assert result.verdict in ("unexplained", "partly_explained")
+    unknown = next(f for f in result.findings if f.effect == "unknown")
+    assert unknown.joints == (3,)
+
+
+def test_a_model_identified_by_a_poor_motion_raises_no_alarm():
+    """Parameters off, forty times what an identification leaves, in six directions that motion hardly shows."""
+    arm = Arm.panda()
+    spread = inertial_spread(arm, "identified", np.full(7, NOISE))
+    change = 40.0 * spread[:, -6:] @ np.random.default_rng(2).normal(size=6)
+    true = dataclasses.replace(arm, standard=arm.standard + change.reshape(7, 10))
+    found = diagnose(None, [record(31, arm=true), record(32, arm=true)])
+    assert found.fit.rmse_before[1] > 1.3 * found.fit.noise_floor[1]  # it shows
+    assert found.findings == ()
+
+
+def test_a_body_held_for_a_while_is_a_payload_change():
+    arm = Arm.panda()
+    body = np.zeros((7, 10))
+    body[6] = [0.4, 0, 0, 0.06, 0.01, 0, 0.01, 0, 0, 0.001]
+    loaded = dataclasses.replace(arm, standard=arm.standard + body)
+
+    def held(t, q, qd, qdd):
+        motions = [Motion(a, t, q, qd, qdd, np.zeros_like(q)).load for a in (loaded, arm)]
+        return (motions[0] - motions[1]) * ((t > 2.5) & (t < 5.0))[:, None]
+
+    (finding,) = diagnose(None, [record(33, held)]).findings
+    assert finding.effect == "payload_change"
+    np.testing.assert_allclose(finding.intervals[0], (2.5, 5.0), atol=0.05)
+    told = {p["name"]: p for p in finding.parameters}
+    assert abs(told["mass"]["value"] - 0.4) < 3 * told["mass"]["std"]
+    assert {"start", "stop"} <= set(told)

@@ -16,6 +16,7 @@ from ..effects.contact import ExternalContact
 from ..effects.friction import CoulombFriction
 from ..effects.load import PayloadChange
 from ..effects.memory import PreslidingHysteresis
+from ..signals import white_noise
 from .problem import Problem, Term
 from .search import ACCEPT, State, instead, leftover, places, shares, without
 from .uncertainty import covariances
@@ -53,6 +54,8 @@ load up to the level, which a sign of the velocity cannot say."""
 _WIDER = ("stribeck_friction", "asymmetric_friction", "load_dependent_friction", "friction_drift")
 BEYOND = 4.0
 """Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""
+_COLOURED = 2.5
+"""How much larger than its white part noise in the band may be."""
 _SMOOTHED, _JOINED = 0.1, 0.3
 """Over which such an error is averaged, and a pause that does not end it [s]."""
 _LISTED = 0.01
@@ -115,14 +118,17 @@ def unexplained(problem: Problem, state: State) -> Finding | None:
     weights = np.concatenate([t.weights for t in problem.traces])
     x = state.design.x[: problem.nuisance[0].shape[2]]
     left = [r - n @ problem.explained(x) for r, n in zip(problem.residual, problem.nuisance, strict=True)]
-    squares = (np.concatenate(left) / state.noise.std) ** 2 * weights**2
+    # what stands off now and then passes for noise of a joint; its torque from sample to sample shows less
+    white = np.median([white_noise(t.signals.tau) for t in problem.traces if t.signals.tau is not None], 0)
+    noise = np.minimum(state.noise.std, _COLOURED * white)
+    squares = (np.concatenate(left) / noise) ** 2 * weights**2
     beyond = squares.sum(0) / np.maximum((weights**2).sum(0), 1.0)
     joint = int(np.argmax(beyond))
     if beyond[joint] < BEYOND:
         return None
     spans = []
     for trace, e, on in zip(problem.traces, left, problem.active, strict=True):
-        power = (e[:, joint] / state.noise.std[joint] * trace.weights[:, joint]) ** 2
+        power = (e[:, joint] / noise[joint] * trace.weights[:, joint]) ** 2
         power = scipy.ndimage.uniform_filter1d(power, max(1, round(_SMOOTHED / trace.motion.dt)))
         spans.append((float(power.sum()) * on, trace, _spans(trace.motion.time, power > BEYOND)))
     _, trace, when = max(spans, key=lambda span: span[0])
