@@ -80,35 +80,42 @@ def settled(
         knowledge, notes = premises.knowledge, premises.notes
         background = tuple(t for t in state.terms if not t.effect.bound_to_recording)
         log.append("suspect recordings beside them")
+    looser: tuple[Premises, State] | None = None
     while True:
         premises = dataclasses.replace(pose(traces, active, knowledge, background), notes=notes)
         state = search(premises.problem, log)
-        premises, state = _loosened(premises, state, log)
         wider = _contradicted(premises, state)
+        if wider is None and looser is None:
+            looser, wider = _loosened(premises, state, log), _bodiless(premises, state)
         if wider is None:
-            return premises, state
+            return (premises, state) if looser is None or _likelier(premises, state, looser[1]) else looser
         notes = (*notes, f"the recordings contradict that the model's numbers are known as {knowledge!r}:"
                  f" they were taken as {wider!r}")  # fmt: skip
         log.append(notes[-1])
         knowledge = wider
 
 
-def _loosened(premises: Premises, state: State, log: list[str]) -> tuple[Premises, State]:
-    """What an identification by a poorer motion leaves to find, if the recordings are as likely with that."""
+def _loosened(premises: Premises, state: State, log: list[str]) -> tuple[Premises, State] | None:
+    """What an identification by a poorer motion leaves to find, if the recordings are likelier with that."""
     if premises.knowledge != "identified" or not state.terms:
-        return premises, state
+        return None
     problem = premises.problem
     loose = pose(problem.traces, problem.active, "identified", premises.background, problem.saturation, LOOSE)
     loose = dataclasses.replace(loose, notes=premises.notes)
     fewer = _needed(loose.problem, state)
     if _credit(fewer) <= _credit(state):
-        return premises, state
+        return None
     if len(fewer.terms) == len(state.terms):
         return loose, fewer
     log.append(f"the model's numbers may have been identified {LOOSE:g} times less well: searched again so")
     other = search(loose.problem, log)
-    before = State(state.terms, other.noise, problem.design(state.terms, other.noise))
-    return (loose, other) if _credit(other) > _credit(before) else (premises, state)
+    return None if _likelier(premises, state, other) else (loose, other)
+
+
+def _likelier(premises: Premises, state: State, other: State) -> bool:
+    """Whether the recordings, claims paid for, are likelier by a state than by another, in the other's noise."""
+    here = State(state.terms, other.noise, premises.problem.design(state.terms, other.noise))
+    return _credit(here) > _credit(other)
 
 
 def _needed(problem: Problem, state: State) -> State:
@@ -136,10 +143,20 @@ def _contradicted(premises: Premises, state: State) -> knowledge_.Knowledge | No
     explained = state.design.log_evidence - problem.design((), state.noise).log_evidence
     other = pose(problem.traces, problem.active, word, premises.background, problem.saturation).problem
     gained = other.design(state.terms, state.noise).log_evidence - state.design.log_evidence
-    if gained > max(CONTRADICTION, SHARE * explained):
-        return word
-    # Several bodies that are not what the model says are one model whose numbers are not known; so is one whose
-    # difference drowns in the noise.
+    return word if gained > max(CONTRADICTION, SHARE * explained) else None
+
+
+def _bodiless(premises: Premises, state: State) -> knowledge_.Knowledge | None:
+    """The wider word, if it does better than bodies found to be wrong.
+
+    Several bodies that are not what the model says are one model whose numbers are not known; so is one whose
+    difference drowns in the noise.
+    """
+    word = knowledge_.wider(premises.knowledge)
+    if word is None:
+        return None
+    problem = premises.problem
+    other = pose(problem.traces, problem.active, word, premises.background, problem.saturation).problem
     bodies = [t for t in state.terms if isinstance(t.effect, InertialParameters | Payload)]
     if not bodies or (len({t.key for t in bodies}) < _SEVERAL and not _faint(state, bodies[0])):
         return None

@@ -41,6 +41,8 @@ _SHAKEN = (2.5, 5.0)
 """Where the bands begin in which noise of q, differentiated twice, may outweigh the motion [Hz]."""
 _SHARPER, _SHARP = 2.5, 6.0
 """Where motion is looked for that a filter took away, in its cutoffs; and how far above noise it must be."""
+_RINGING = 0.2
+"""Share of it with which the filter of q still rings a period of its cutoff away."""
 _STILL = 3e-3
 """Travel below which a joint stands still in a recording [rad]."""
 _BESIDE = 0.02
@@ -240,12 +242,16 @@ def _unsure_sign(
 def _cut_off(
     q: Float[np.ndarray, "time dof"], qdd: Float[np.ndarray, "time dof"], cutoff: float, rate: float
 ) -> Float[np.ndarray, "time dof"]:
-    """Acceleration that the filter of q takes away [rad/s²]: where it is far above its noise, and as long as the
-    filter rings around there; else 0."""
+    """Acceleration that the filter of q takes away [rad/s²]: where it is far above its noise, and a share of it
+    as long as the filter rings around there; else 0."""
     lost = np.abs(_derivatives(q, min(_SHARPER * cutoff, 0.4 * rate), rate)[2] - qdd)
     noise = np.median(lost, axis=0) / 0.6745
     lost = np.where(lost > _SHARP * noise, lost, 0.0)
-    return scipy.ndimage.maximum_filter1d(lost, 2 * round(rate / cutoff) + 1, axis=0)
+    near, far = (
+        scipy.ndimage.maximum_filter1d(lost, 2 * round(rate * reach) + 1, axis=0)
+        for reach in (2 * _BESIDE, 1 / cutoff)
+    )
+    return np.maximum(near, _RINGING * far)
 
 
 def held_sign(
