@@ -157,8 +157,8 @@ def deviations(entry, finding):
     """How many standard deviations the answer's numbers are from the truth's, where they mean the same."""
     found = []
     for name, called, truth_of in SAME.get(entry["effect"], []):
-        for told in (p for p in entry["parameters"] if p["name"] == name):
-            ours = [p for p in finding["parameters"] if p["name"] == called]
+        for told in (p for p in entry.get("parameters", ()) if p["name"] == name):
+            ours = [p for p in finding.get("parameters", ()) if p["name"] == called]
             if len(ours) > 1:
                 ours = [p for p in ours if p["joint"] == told["joint"]]
             for p in ours[:1]:
