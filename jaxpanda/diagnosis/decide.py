@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 import scipy.special
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..effects import CATALOGUE, AbstractEffect
 from ..effects.contact import ExternalContact
@@ -56,8 +56,10 @@ BEYOND = 4.0
 """Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""
 _COLOURED = 2.5
 """How much larger than its white part noise in the band may be."""
-_SMOOTHED, _JOINED = 0.1, 0.3
+_SMOOTHED, _PAUSE = 0.1, 0.3
 """Over which such an error is averaged, and a pause that does not end it [s]."""
+_TOUCHING = 0.15
+"""Pause between events that happened at once [s]."""
 _LISTED = 0.01
 """Probability from which a rival is listed."""
 
@@ -115,25 +117,28 @@ def findings(problem: Problem, state: State) -> list[Finding]:
 
 def unexplained(problem: Problem, state: State) -> Finding | None:
     """The joint that is farthest beyond its noise where nothing was found, and when it is; None if none is."""
-    weights = np.concatenate([t.weights for t in problem.traces])
-    x = state.design.x[: problem.nuisance[0].shape[2]]
-    left = [r - n @ problem.explained(x) for r, n in zip(problem.residual, problem.nuisance, strict=True)]
+    parts = zip(problem.residual, problem.nuisance, problem.traces, problem.active, strict=True)
+    x = problem.explained(state.design.x)
+    suspect = [(r - n @ x, trace) for r, n, trace, on in parts if on]
+    left = np.concatenate([e for e, _ in suspect])
+    weights = np.concatenate([trace.weights for _, trace in suspect])
     # what stands off now and then passes for noise of a joint; its torque from sample to sample shows less
     white = np.median([white_noise(t.signals.tau) for t in problem.traces if t.signals.tau is not None], 0)
     noise = np.minimum(state.noise.std, _COLOURED * white)
-    squares = (np.concatenate(left) / noise) ** 2 * weights**2
-    beyond = squares.sum(0) / np.maximum((weights**2).sum(0), 1.0)
+    weight = np.maximum(np.mean(weights**2, 0), 1e-9)
+    beyond = np.mean((left / noise * weights) ** 2, 0) / weight
     joint = int(np.argmax(beyond))
     if beyond[joint] < BEYOND:
         return None
-    spans = []
-    for trace, e, on in zip(problem.traces, left, problem.active, strict=True):
-        power = (e[:, joint] / noise[joint] * trace.weights[:, joint]) ** 2
+    seen = []
+    for e, trace in suspect:
+        power = (e[:, joint] / noise[joint] * trace.weights[:, joint]) ** 2 / weight[joint]
         power = scipy.ndimage.uniform_filter1d(power, max(1, round(_SMOOTHED / trace.motion.dt)))
-        spans.append((float(power.sum()) * on, trace, _spans(trace.motion.time, power > BEYOND)))
-    _, trace, when = max(spans, key=lambda span: span[0])
-    whole = sum(b - a for a, b in when) > 0.5 * float(np.ptp(trace.motion.time))
-    rms = np.sqrt(np.mean(np.concatenate(left) ** 2, 0)) * (np.arange(problem.dof) == joint)
+        seen.append((float(power[power > BEYOND].sum()), trace, trace.motion.time[power > BEYOND]))
+    _, trace, times = max(seen, key=lambda one: one[0])
+    when = _joined([(float(t), float(t)) for t in times], _PAUSE)
+    whole = not when or sum(b - a for a, b in when) > 0.5 * float(np.ptp(trace.motion.time))
+    rms = np.sqrt(np.mean(left**2, 0)) * (np.arange(problem.dof) == joint)
     return Finding(
         effect="unknown",
         joints=(joint,),
@@ -150,19 +155,6 @@ def unexplained(problem: Problem, state: State) -> Finding | None:
         + "; neither a named effect nor a free curve explains it.",
         terms=(),
     )
-
-
-def _spans(
-    time: Float[np.ndarray, " time"], on: Bool[np.ndarray, " time"]
-) -> tuple[tuple[float, float], ...]:
-    """From when to when, short pauses left out."""
-    out: list[tuple[float, float]] = []
-    for t in time[on]:
-        if out and t - out[-1][1] < _JOINED:
-            out[-1] = out[-1][0], float(t)
-        else:
-            out.append((float(t), float(t)))
-    return tuple(out)
 
 
 def crowd(
@@ -274,7 +266,8 @@ def coefficients(state: State, i: int) -> Float[np.ndarray, " n"]:
 
 def torque(state: State, i: int) -> list[Float[np.ndarray, "_time dof"]]:
     """Torque of a term in each recording [N m]."""
-    return [columns @ coefficients(state, i) for columns in state.terms[i].columns]
+    c = coefficients(state, i)
+    return [columns @ c for columns in state.terms[i].columns]
 
 
 def _finding(
@@ -340,13 +333,18 @@ def _intervals(problem: Problem, terms: Sequence[Term]) -> tuple[tuple[float, fl
     trace = next(t for t in problem.traces if t.name == getattr(terms[0].effect, "recording", t.name))
     first, last = float(trace.channels.t[0]), float(trace.channels.t[-1])
     spans = sorted((max(first, float(t.effect.start)), min(last, float(t.effect.stop))) for t in terms)  # pyright: ignore
-    joined = [spans[0]]
+    return _joined(spans, _TOUCHING)
+
+
+def _joined(spans: Sequence[tuple[float, float]], pause: float) -> tuple[tuple[float, float], ...]:
+    """Spans in order, those with no longer a pause between them made one."""
+    out = list(spans[:1])
     for start, stop in spans[1:]:
-        if start <= joined[-1][1] + 0.15:
-            joined[-1] = (joined[-1][0], max(joined[-1][1], stop))
+        if start <= out[-1][1] + pause:
+            out[-1] = (out[-1][0], max(out[-1][1], stop))
         else:
-            joined.append((start, stop))
-    return tuple(joined)
+            out.append((start, stop))
+    return tuple(out)
 
 
 def _summary(name, joints, rms, intervals, recordings, alternatives, problem, own, equation) -> str:

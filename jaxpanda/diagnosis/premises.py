@@ -153,13 +153,13 @@ def _bodiless(premises: Premises, state: State) -> knowledge_.Knowledge | None:
     difference drowns in the noise.
     """
     word = knowledge_.wider(premises.knowledge)
-    if word is None:
+    bodies = [t for t in state.terms if isinstance(t.effect, InertialParameters | Payload)]
+    if word is None or not bodies:
+        return None
+    if len({t.key for t in bodies}) < _SEVERAL and not _faint(state, bodies[0]):
         return None
     problem = premises.problem
     other = pose(problem.traces, problem.active, word, premises.background, problem.saturation).problem
-    bodies = [t for t in state.terms if isinstance(t.effect, InertialParameters | Payload)]
-    if not bodies or (len({t.key for t in bodies}) < _SEVERAL and not _faint(state, bodies[0])):
-        return None
     others = tuple(t for t in state.terms if all(t is not b for b in bodies))
     return word if other.design(others, state.noise).log_evidence > state.design.log_evidence else None
 

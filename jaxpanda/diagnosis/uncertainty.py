@@ -15,20 +15,18 @@ Each parameter takes the larger deviation of the two; correlations are the first
 """
 
 import dataclasses
-import itertools
 
 import numpy as np
 from jaxtyping import Float
 from scipy.signal import lfilter
 
 from ..effects import AbstractEffect
+from ..identification import statistics
 from .evidence import Design
 from .noise import autoregression
 from .problem import Problem, Term
 from .search import State, first_steps, moved, places, within
 
-BLOCKS = 20
-"""Blocks of the jackknife."""
 _STEP_LOG, _STEP_SHARE, _STEP_TIME = 0.02, 0.002, 0.01
 """Steps of the differences: of a logarithm, as a share of the bounds, and of an instant [s]."""
 _POLISHED, _ENOUGH = 5, 0.01
@@ -113,7 +111,8 @@ def covariances(problem: Problem, state: State) -> list[Float[np.ndarray, "n n"]
         return []
     near = linearised(problem, state)
     C = _under_noise(near.design)
-    ratio = np.sqrt(np.maximum(_jackknife(near.design) / np.maximum(np.diag(C), 1e-300), 1.0))
+    variance = np.diag(_by_blocks(near.design))
+    ratio = np.sqrt(np.maximum(variance / np.maximum(np.diag(C), 1e-300), 1.0))
     C = ratio[:, None] * C * ratio
     first = len(C) - len(near.shapes)
     out = []
@@ -163,18 +162,13 @@ def _under_noise(design: Design) -> Float[np.ndarray, "n n"]:
     return design.solve(np.swapaxes(half, 0, 1))
 
 
-def _jackknife(design: Design) -> Float[np.ndarray, " n"]:
-    """Variance of each unknown, by leaving out one block of time after another."""
-    rows = len(design.residual[0])
-    edges = np.linspace(0, rows, BLOCKS + 1).round().astype(int)
-    H = design.information
-    unit = 1 / np.sqrt(np.diag(H))
-    less, scores = np.zeros((BLOCKS, *H.shape)), np.zeros((BLOCKS, len(H)))
+def _by_blocks(design: Design) -> Float[np.ndarray, "n n"]:
+    """Covariance of the unknowns by the jackknife over blocks of time."""
+    blocks = statistics.cut(len(design.residual[0]), statistics.BLOCKS)
+    informations = [np.zeros_like(design.information) for _ in blocks]
+    scores = [np.zeros_like(design.g) for _ in blocks]
     for A, left in zip(design.columns, design.left, strict=True):
-        for b, (first, last) in enumerate(itertools.pairwise(edges)):
-            part = A[first:last] * unit
-            less[b] += part.T @ part
-            scores[b] += part.T @ left[first:last]
-    moves = -np.linalg.solve(unit[:, None] * H * unit - less, scores[:, :, None])[:, :, 0] * unit
-    moves -= moves.mean(0)
-    return (BLOCKS - 1) / BLOCKS * np.sum(moves**2, 0)
+        for b, block in enumerate(blocks):
+            informations[b] += A[block].T @ A[block]
+            scores[b] += A[block].T @ left[block]
+    return statistics.jackknife(design.information, informations, scores)

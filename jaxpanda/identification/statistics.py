@@ -43,22 +43,43 @@ def covariances(
         e = r.residual(x)
         total += e.size
         squares += float(np.sum(weights[:, None] * e**2))
-        for block in _cut(
+        for block in cut(
             e.shape[1], max(2, round(BLOCKS * e.shape[1] / sum(s.y.shape[1] for s in regressions)))
         ):
             A = r.A[:, block]
             informations.append(np.einsum("j,jta,jtb->ab", weights, A, A, optimize=True))
             scores.append(np.einsum("j,jta,jt->a", weights, A, e[:, block], optimize=True))
             H += informations[-1]
-    scale = np.sqrt(np.where(np.diag(H) > 0, np.diag(H), 1.0))
+    scale = _units(H)
+    scaling = np.outer(scale, scale)
+    classical = squares / max(total - len(x), 1) * _inverse(H / scaling)
+    return jackknife(H, informations, scores), classical / scaling
+
+
+def jackknife(
+    H: Float[np.ndarray, "n n"],
+    informations: Sequence[Float[np.ndarray, "n n"]],
+    scores: Sequence[Float[np.ndarray, " n"]],
+) -> Float[np.ndarray, "n n"]:
+    """Covariance of estimated unknowns, by leaving out one block after another.
+
+    Args:
+        H: information of all blocks, and of a prior if there is one.
+        informations: what each block adds to it.
+        scores: $A_b^\\top e_b$ of each block, with the weighted residual of the estimate.
+    """
+    scale = _units(H)
     scaling = np.outer(scale, scale)
     moves = np.stack(
         [-_inverse((H - Hb) / scaling) @ (s / scale) for Hb, s in zip(informations, scores, strict=True)]
     )
     moves -= moves.mean(0)
-    robust = (len(moves) - 1) / len(moves) * moves.T @ moves
-    classical = squares / max(total - len(x), 1) * _inverse(H / scaling)
-    return robust / scaling, classical / scaling
+    return (len(moves) - 1) / len(moves) * moves.T @ moves / scaling
+
+
+def _units(H: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
+    """In which the information of every unknown is one."""
+    return np.sqrt(np.where(np.diag(H) > 0, np.diag(H), 1.0))
 
 
 def determined(
@@ -66,13 +87,14 @@ def determined(
 ) -> Bool[np.ndarray, " unknowns"]:
     """Which unknowns the data tell at all: those without part in any direction that moves no torque."""
     H = np.sum([np.einsum("j,jta,jtb->ab", 1 / sigma**2, r.A, r.A, optimize=True) for r in regressions], 0)
-    scale = np.sqrt(np.where(np.diag(H) > 0, np.diag(H), 1.0))
+    scale = _units(H)
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     null = vectors[:, values < UNDETERMINED**2 * values[-1] + 1e-14 * len(H)]
     return np.sum(null**2, axis=1) < 1e-6
 
 
-def _cut(samples: int, blocks: int) -> list[slice]:
+def cut(samples: int, blocks: int) -> list[slice]:
+    """Stretches of about as many samples each."""
     edges = np.linspace(0, samples, min(blocks, samples) + 1).round().astype(int)
     return [slice(a, b) for a, b in itertools.pairwise(edges)]
 
