@@ -34,6 +34,8 @@ Device = Any
 
 _QUICKLY = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 """Compiles the solver in a third of the time on a CPU, and it runs as fast."""
+_PIECE = 16384
+"""Starts fetched at once: memory for a large chunk would be new to the process every time, page after page."""
 _WORTH = 4  # chunks a further CPU device must get: it shares the cores, and compiling for it costs as much
 
 
@@ -79,33 +81,41 @@ def run(
     programs, like = _compiled(solve, options, structure, shapes, chunk, tuple(mine))
     placed = [jax.device_put(leaves, device) for device in mine]
     compiled = time.perf_counter()
-    outcome = tuple(np.empty((starts, *one.shape[1:]), one.dtype) for one in jax.tree.leaves(like))
+    rows, form = jax.tree.flatten(like)
+    outcome = tuple(np.empty((starts, *one.shape[1:]), one.dtype) for one in rows)
     done = _taken_up(checkpoint, outcome, shared)
     if progress is not None and done:
         progress(done, starts)
 
-    def solved(device: int, first: int) -> list[Array]:
+    def solved(device: int, first: int) -> list[list[Array]]:
         numbers = np.arange(first, first + chunk)
         numbers[numbers >= starts] = -1
-        return jax.tree.leaves(programs[device](placed[device], jax.device_put(numbers, mine[device])))
+        pieces = programs[device](placed[device], jax.device_put(numbers, mine[device]))
+        return [jax.tree.leaves(piece) for piece in pieces]
 
-    def begin(first: int) -> list[Future[list[Array]]]:
+    def begin(first: int) -> list[Future[list[list[Array]]]]:
         """This process's chunks from this start on."""
         first += (jax.process_index() if shared else 0) * share * chunk
         return [hands[k % len(mine)].submit(solved, k % len(mine), first + k * chunk) for k in range(share)]
 
-    def finish(first: int, chunks: list[Future[list[Array]]]) -> None:
+    def keep(first: int, pieces: list[list[Array]]) -> None:
+        """Copy what is wanted of a chunk into the outcome."""
+        for at in range(first, min(first + chunk, starts), _PIECE):
+            for whole, part in zip(
+                outcome, pieces.pop(0), strict=True
+            ):  # an array keeps its copy on the host
+                whole[at : at + len(part)] = np.asarray(part)[: starts - at]
+
+    def finish(first: int, chunks: list[Future[list[list[Array]]]]) -> None:
         last = min(first + wave, starts)
         if shared:
-            fetched = jax.device_get([one.result() for one in chunks])
+            fetched = jax.device_get([piece for one in chunks for piece in one.result()])
             together = [np.concatenate(part) for part in zip(*fetched, strict=True)]
-            parts = [(first, multihost_utils.process_allgather(together, tiled=True))]
+            everywhere = multihost_utils.process_allgather(together, tiled=True)
+            for whole, part in zip(outcome, everywhere, strict=True):
+                whole[first:last] = part[: last - first]
         else:
-            parts = ((first + k * chunk, one.result()) for k, one in enumerate(chunks))
-        for at, rows in parts:
-            for whole, part in zip(outcome, rows, strict=True):
-                here = whole[at:last][: len(part)]  # none of a chunk past the last start
-                here[:] = np.asarray(part)[: len(here)]
+            list(fetchers.map(lambda k: keep(first + k * chunk, chunks[k].result()), range(share)))
         if checkpoint is not None and jax.process_index() == 0:
             checkpoint.append(first, tuple(whole[first:last] for whole in outcome))
         if progress is not None:
@@ -113,10 +123,11 @@ def run(
 
     wave = share * chunk * len(processes)
     ahead = 0 if on_cpu else 1  # waves under way while one is fetched
-    under_way: collections.deque[tuple[int, list[Future[list[Array]]]]] = collections.deque()
+    under_way: collections.deque[tuple[int, list[Future[list[list[Array]]]]]] = collections.deque()
     with contextlib.ExitStack() as stack:
         # A GPU's program asks the host whether to go round its loop again, and holds the thread that called it.
         hands = [stack.enter_context(ThreadPoolExecutor(1)) for _ in mine]
+        fetchers = stack.enter_context(ThreadPoolExecutor(len(mine)))
         for first in range(done, starts, wave):
             under_way.append((first, begin(first)))
             if len(under_way) > ahead:
@@ -124,7 +135,7 @@ def run(
         while under_way:
             finish(*under_way.popleft())
     return (
-        jax.tree.unflatten(jax.tree.structure(like), outcome),
+        jax.tree.unflatten(form, outcome),
         compiled - began,
         time.perf_counter() - compiled,
     )
@@ -137,8 +148,8 @@ def _compiled(
     shapes: tuple[tuple[tuple[int, ...], Any], ...],
     chunk: int,
     devices: tuple[Device, ...],
-) -> tuple[list[Callable[..., PyTree[Array]]], PyTree[jax.ShapeDtypeStruct]]:
-    """The program for a chunk on each device, and what it returns."""
+) -> tuple[list[Callable[..., list[PyTree[Array]]]], PyTree[jax.ShapeDtypeStruct]]:
+    """The program for a chunk on each device, which returns it piece by piece, and what a piece is like."""
     of_one = functools.partial(_program, _jitted(solve, options, structure), shapes, chunk)
     # Where there is a compilation cache, it has the program for all GPUs from the first on.
     alone = [] if devices[0].platform == "cpu" else [of_one(devices[0])]
@@ -149,8 +160,10 @@ def _compiled(
 
 @functools.lru_cache(maxsize=16)
 def _jitted(solve: Chunk, options: tuple[Hashable, ...], structure: Any) -> Any:
-    def of_chunk(leaves: list[Array], numbers: Int[Array, " chunk"]) -> PyTree[Array]:
-        return solve(jax.tree.unflatten(structure, leaves), numbers, *options)
+    def of_chunk(leaves: list[Array], numbers: Int[Array, " chunk"]) -> list[PyTree[Array]]:
+        found = solve(jax.tree.unflatten(structure, leaves), numbers, *options)
+        piece = lambda first: jax.tree.map(lambda rows: rows[first : first + _PIECE], found)
+        return [piece(first) for first in range(0, len(numbers), _PIECE)]
 
     return jax.jit(of_chunk)
 
@@ -158,7 +171,7 @@ def _jitted(solve: Chunk, options: tuple[Hashable, ...], structure: Any) -> Any:
 @functools.lru_cache(maxsize=64)
 def _program(
     jitted: Any, shapes: tuple[tuple[tuple[int, ...], Any], ...], chunk: int, device: Device
-) -> tuple[Callable[..., PyTree[Array]], PyTree[jax.ShapeDtypeStruct]]:
+) -> tuple[Callable[..., list[PyTree[Array]]], PyTree[jax.ShapeDtypeStruct]]:
     """Kept, because cross-validation solves one shape many times."""
     where = SingleDeviceSharding(device)
     shaped = lambda shape, dtype: jax.ShapeDtypeStruct(shape, dtype, sharding=where)
@@ -166,8 +179,8 @@ def _program(
     lowered = jitted.lower(leaves, shaped((chunk,), jnp.asarray(0).dtype))
     if device.platform == "cpu":
         with contextlib.suppress(jax.errors.JaxRuntimeError):  # another version may not know these options
-            return lowered.compile(compiler_options=_QUICKLY), lowered.out_info
-    return lowered.compile(), lowered.out_info
+            return lowered.compile(compiler_options=_QUICKLY), lowered.out_info[0]
+    return lowered.compile(), lowered.out_info[0]
 
 
 def _taken_up(checkpoint: Checkpoint | None, outcome: tuple[np.ndarray, ...], shared: bool) -> int:
