@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
+from jax.experimental import multihost_utils
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -73,12 +74,14 @@ def join(processes: str) -> None:
             jax.distributed.initialize()
         else:
             jax.distributed.initialize(found[3], int(found[2]), int(found[1]))
+        # What connects the processes reports that to file 1, where --json allows one document and nothing else.
+        sys.stdout.flush()
+        sys.stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        os.dup2(2, 1)
+        # They connect when they first share something, and give up after 30 s: now, not after each has compiled.
+        multihost_utils.sync_global_devices("jaxpanda")
     except (ValueError, RuntimeError) as error:
         raise InputError(f"--processes {processes}: the others were not found ({error})") from None
-    # What connects the processes reports that to file 1, where --json allows one document and nothing else.
-    sys.stdout.flush()
-    sys.stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
 
 
 Tick = Callable[[int, int], None]

@@ -215,17 +215,21 @@ def test_two_processes_share_the_starts_and_the_first_alone_writes(table, tmp_pa
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
     outs = [tmp_path / "first", tmp_path / "second"]
+    as_it_is = "import sys; from jaxpanda.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    # longer than processes wait for each other when they first connect
+    late = "import time; from jaxpanda import session; join = session.join; "
+    late += "session.join = lambda given: (join(given), time.sleep(40)); " + as_it_is
     running = [
         subprocess.Popen(
             [
-                *(sys.executable, "-m", "jaxpanda", "retrieve", *table),
+                *(sys.executable, "-c", code, "retrieve", *table),
                 *("--out", str(out), "--processes", f"{rank}/2@{address}"),
             ],
             env=environment(),
             stdout=subprocess.PIPE,
             text=True,
         )
-        for rank, out in enumerate(outs)
+        for rank, (code, out) in enumerate(zip((as_it_is, late), outs, strict=True))
     ]
     printed = [process.communicate(timeout=300)[0] for process in running]
     assert [process.returncode for process in running] == [0, 0]
