@@ -11,7 +11,7 @@ import scipy.interpolate
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis.coverage import held_out_gains, least_shown
-from jaxpanda.diagnosis.decide import Finding
+from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.next_motion import motions, next_motion
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem

@@ -1,13 +1,10 @@
 """From accepted terms to findings: merged, weighed against their rivals, and said in words."""
 
-import dataclasses
 import itertools
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
-import scipy.ndimage
 import scipy.special
 from jaxtyping import Float
 
@@ -16,10 +13,11 @@ from ..effects.contact import ExternalContact
 from ..effects.friction import CoulombFriction
 from ..effects.load import PayloadChange
 from ..effects.memory import PreslidingHysteresis
-from ..signals import white_noise
+from .finding import Finding, joined
 from .problem import Problem, Term
 from .search import ACCEPT, State, instead, leftover, places, shares, without
 from .uncertainty import covariances
+from .unnamed import hum, standing_off
 
 TEMPERATURE, RELATIVE_TEMPERATURE = 3.0, 0.0003
 """By which differences of evidence are divided [nats, share of the evidence]: laws are never quite right, so that
@@ -52,52 +50,10 @@ STICKS = 1.5e-3
 """Breakaway distance below which friction with memory is Coulomb's that sticks [rad]: a joint at rest holds any
 load up to the level, which a sign of the velocity cannot say."""
 _WIDER = ("stribeck_friction", "asymmetric_friction", "load_dependent_friction", "friction_drift")
-BEYOND = 4.0
-"""Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""
-_COLOURED = 2.5
-"""How much larger than its white part noise in the band may be."""
-_SMOOTHED, _PAUSE = 0.1, 0.3
-"""Over which such an error is averaged, and a pause that does not end it [s]."""
 _TOUCHING = 0.15
 """Pause between events that happened at once [s]."""
 _LISTED = 0.01
 """Probability from which a rival is listed."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Finding:
-    """One effect that the model was missing."""
-
-    effect: str
-    joints: tuple[int, ...]
-    """0-based."""
-    recordings: tuple[str, ...]
-    intervals: tuple[tuple[float, float], ...] | None
-    confidence: float
-    alternatives: tuple[tuple[str, float], ...]
-    equation: str
-    parameters: tuple[Mapping[str, Any], ...]
-    rms_torque: Float[np.ndarray, " dof"]
-    evidence: float
-    """Over the model without it [nats]."""
-    summary: str
-    terms: tuple[int, ...]
-    """Which terms of the model it consists of."""
-
-    def to_json(self) -> dict[str, Any]:
-        return {
-            "effect": self.effect,
-            "joints": [j + 1 for j in self.joints],
-            "recordings": list(self.recordings),
-            "intervals": None if self.intervals is None else [list(pair) for pair in self.intervals],
-            "confidence": self.confidence,
-            "alternatives": [{"effect": name, "confidence": p} for name, p in self.alternatives],
-            "equation": self.equation,
-            "parameters": [dict(p) for p in self.parameters],
-            "rms_torque": [float(v) for v in self.rms_torque],
-            "evidence_nats": self.evidence,
-            "summary": self.summary,
-        }
 
 
 def findings(problem: Problem, state: State) -> list[Finding]:
@@ -111,50 +67,11 @@ def findings(problem: Problem, state: State) -> list[Finding]:
     doubt = doubt * np.exp(-DOUBT * where @ left)
     spread = covariances(problem, state)
     out = [_finding(problem, state, group, names[group[0]], rivals, doubt, spread) for group in groups]
-    left_over = unexplained(problem, state) if not out else None
-    return [left_over] if left_over is not None else sorted(out, key=lambda f: -f.evidence)
-
-
-def unexplained(problem: Problem, state: State) -> Finding | None:
-    """The joint that is farthest beyond its noise where nothing was found, and when it is; None if none is."""
-    parts = zip(problem.residual, problem.nuisance, problem.traces, problem.active, strict=True)
-    x = problem.explained(state.design.x)
-    suspect = [(r - n @ x, trace) for r, n, trace, on in parts if on]
-    left = np.concatenate([e for e, _ in suspect])
-    weights = np.concatenate([trace.weights for _, trace in suspect])
-    # what stands off now and then passes for noise of a joint; its torque from sample to sample shows less
-    white = np.median([white_noise(t.signals.tau) for t in problem.traces if t.signals.tau is not None], 0)
-    noise = np.minimum(state.noise.std, _COLOURED * white)
-    weight = np.maximum(np.mean(weights**2, 0), 1e-9)
-    beyond = np.mean((left / noise * weights) ** 2, 0) / weight
-    joint = int(np.argmax(beyond))
-    if beyond[joint] < BEYOND:
-        return None
-    seen = []
-    for e, trace in suspect:
-        power = (e[:, joint] / noise[joint] * trace.weights[:, joint]) ** 2 / weight[joint]
-        power = scipy.ndimage.uniform_filter1d(power, max(1, round(_SMOOTHED / trace.motion.dt)))
-        seen.append((float(power[power > BEYOND].sum()), trace, trace.motion.time[power > BEYOND]))
-    _, trace, times = max(seen, key=lambda one: one[0])
-    when = _joined([(float(t), float(t)) for t in times], _PAUSE)
-    whole = not when or sum(b - a for a, b in when) > 0.5 * float(np.ptp(trace.motion.time))
-    rms = np.sqrt(np.mean(left**2, 0)) * (np.arange(problem.dof) == joint)
-    return Finding(
-        effect="unknown",
-        joints=(joint,),
-        recordings=(trace.name,),
-        intervals=None if whole else when,
-        confidence=float(1 - 1 / beyond[joint]),
-        alternatives=(),
-        equation="no law was found",
-        parameters=(),
-        rms_torque=rms,
-        evidence=float(0.5 * np.sum(weights[:, joint] > 0) * (beyond[joint] - 1 - np.log(beyond[joint]))),
-        summary=f"Joint {joint + 1} is {np.sqrt(beyond[joint]):.1f} times its noise off the simulation"
-        + ("" if whole else f" at times, in {trace.name} first from {when[0][0]:.2f} s to {when[0][1]:.2f} s")
-        + "; neither a named effect nor a free curve explains it.",
-        terms=(),
-    )
+    # what is in the band of the search belongs to what was found there
+    lowest = {"lowest": problem.traces[0].cutoff} if out else {}
+    unnamed = hum([t.signals for t in problem.traces], problem.active, state.noise.std, **lowest)
+    unnamed = unnamed or (None if out else standing_off(problem, state))
+    return sorted(out, key=lambda f: -f.evidence) + ([unnamed] if unnamed else [])
 
 
 def crowd(
@@ -333,18 +250,7 @@ def _intervals(problem: Problem, terms: Sequence[Term]) -> tuple[tuple[float, fl
     trace = next(t for t in problem.traces if t.name == getattr(terms[0].effect, "recording", t.name))
     first, last = float(trace.channels.t[0]), float(trace.channels.t[-1])
     spans = sorted((max(first, float(t.effect.start)), min(last, float(t.effect.stop))) for t in terms)  # pyright: ignore
-    return _joined(spans, _TOUCHING)
-
-
-def _joined(spans: Sequence[tuple[float, float]], pause: float) -> tuple[tuple[float, float], ...]:
-    """Spans in order, those with no longer a pause between them made one."""
-    out = list(spans[:1])
-    for start, stop in spans[1:]:
-        if start <= out[-1][1] + pause:
-            out[-1] = (out[-1][0], max(out[-1][1], stop))
-        else:
-            out.append((start, stop))
-    return tuple(out)
+    return joined(spans, _TOUCHING)
 
 
 def _summary(name, joints, rms, intervals, recordings, alternatives, problem, own, equation) -> str:

@@ -21,7 +21,8 @@ from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, load
 from . import knowledge as knowledge_
 from .coverage import HeatMap, Least, heat_map, least_shown
-from .decide import Finding, coefficients, findings, partly
+from .decide import coefficients, findings, partly
+from .finding import Finding
 from .host import on_host
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion

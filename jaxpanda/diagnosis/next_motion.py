@@ -23,9 +23,10 @@ from jaxtyping import Float
 from .. import files
 from ..arm import Arm
 from ..effects import AbstractEffect, AbstractJointEffect, Channels, Motion
-from .decide import Finding, coefficients
+from .decide import coefficients
 from .events import Proposal, ripple
 from .evidence import Noise
+from .finding import Finding
 from .knowledge import Knowledge, nuisance
 from .library import columns_of
 from .problem import Problem, Term, posed

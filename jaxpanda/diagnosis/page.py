@@ -12,8 +12,9 @@ from jaxtyping import Float
 from .. import summaries
 from ..effects import CATALOGUE, AbstractEffect
 from ..report import Figure, Listing, Section, Table, number
-from .decide import Finding, coefficients
+from .decide import coefficients
 from .diagnosis import NEXT_MOTION, Diagnosis
+from .finding import Finding
 from .localise import REGIMES, Localisation, lag_profile, order_spectrum, since_reversal
 
 _POINTS = 900

@@ -1,0 +1,55 @@
+"""What a diagnosis says: one effect, where and when, how sure it is and what else it could be."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One effect that the model was missing."""
+
+    effect: str
+    joints: tuple[int, ...]
+    """0-based."""
+    recordings: tuple[str, ...]
+    intervals: tuple[tuple[float, float], ...] | None
+    confidence: float
+    alternatives: tuple[tuple[str, float], ...]
+    equation: str
+    parameters: tuple[Mapping[str, Any], ...]
+    rms_torque: Float[np.ndarray, " dof"]
+    evidence: float
+    """Over the model without it [nats]."""
+    summary: str
+    terms: tuple[int, ...]
+    """Which terms of the model it consists of."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "effect": self.effect,
+            "joints": [j + 1 for j in self.joints],
+            "recordings": list(self.recordings),
+            "intervals": None if self.intervals is None else [list(pair) for pair in self.intervals],
+            "confidence": self.confidence,
+            "alternatives": [{"effect": name, "confidence": p} for name, p in self.alternatives],
+            "equation": self.equation,
+            "parameters": [dict(p) for p in self.parameters],
+            "rms_torque": [float(v) for v in self.rms_torque],
+            "evidence_nats": self.evidence,
+            "summary": self.summary,
+        }
+
+
+def joined(spans: Sequence[tuple[float, float]], pause: float) -> tuple[tuple[float, float], ...]:
+    """Spans in order, those with no longer a pause between them made one."""
+    out = list(spans[:1])
+    for start, stop in spans[1:]:
+        if start <= out[-1][1] + pause:
+            out[-1] = (out[-1][0], max(out[-1][1], stop))
+        else:
+            out.append((start, stop))
+    return tuple(out)

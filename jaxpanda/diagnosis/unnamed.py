@@ -1,0 +1,185 @@
+r"""What no effect of the catalogue explains, and no free curve either.
+
+- A joint that stands off its noise, always or now and then.
+- A torque that hums: a line in its spectrum, as the mains, a fan or a shaking floor leave, at one frequency
+  whatever the arm does. It is looked for in the torque as measured, also above the band in which effects are
+  fitted, under Hann's window. A motion's harmonics come many together, and what depends on the motion is as wide
+  as that is uneven: a line counts that is far above everything near it.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.ndimage
+from jaxtyping import Float
+from scipy.signal.windows import hann
+
+from ..signals import Signals, white_noise
+from .finding import Finding, joined
+from .problem import Problem
+from .search import State
+
+BEYOND = 4.0
+"""Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""
+_COLOURED = 2.5
+"""How much larger than its white part noise in the band may be."""
+_SMOOTHED, _PAUSE = 0.1, 0.3
+"""Over which such an error is averaged, and a pause that does not end it [s]."""
+_LOWEST, _NEARBY = 5.0, 2.0
+"""From where lines are looked for, and how far around them nothing else may be [Hz]."""
+_ALONE, _HEARD = 20.0, 0.5
+"""By which factor a line's power exceeds any other there, and its rms over the noise's from which it counts."""
+_LOBE = 3
+"""Bins on either side that a line takes under the window."""
+
+
+def standing_off(problem: Problem, state: State) -> Finding | None:
+    """The joint that is farthest beyond its noise where nothing was found, and when it is; None if none is."""
+    parts = zip(problem.residual, problem.nuisance, problem.traces, problem.active, strict=True)
+    x = problem.explained(state.design.x)
+    suspect = [(r - n @ x, trace) for r, n, trace, on in parts if on]
+    left = np.concatenate([e for e, _ in suspect])
+    weights = np.concatenate([trace.weights for _, trace in suspect])
+    # what stands off now and then passes for noise of a joint; its torque from sample to sample shows less
+    white = np.median([white_noise(t.signals.tau) for t in problem.traces if t.signals.tau is not None], 0)
+    noise = np.minimum(state.noise.std, _COLOURED * white)
+    weight = np.maximum(np.mean(weights**2, 0), 1e-9)
+    beyond = np.mean((left / noise * weights) ** 2, 0) / weight
+    joint = int(np.argmax(beyond))
+    if beyond[joint] < BEYOND:
+        return None
+    seen = []
+    for e, trace in suspect:
+        power = (e[:, joint] / noise[joint] * trace.weights[:, joint]) ** 2 / weight[joint]
+        power = scipy.ndimage.uniform_filter1d(power, max(1, round(_SMOOTHED / trace.motion.dt)))
+        seen.append((float(power[power > BEYOND].sum()), trace, trace.motion.time[power > BEYOND]))
+    _, trace, times = max(seen, key=lambda one: one[0])
+    when = joined([(float(t), float(t)) for t in times], _PAUSE)
+    whole = not when or sum(b - a for a, b in when) > 0.5 * float(np.ptp(trace.motion.time))
+    rms = np.sqrt(np.mean(left**2, 0)) * (np.arange(problem.dof) == joint)
+    return Finding(
+        effect="unknown",
+        joints=(joint,),
+        recordings=(trace.name,),
+        intervals=None if whole else when,
+        confidence=float(1 - 1 / beyond[joint]),
+        alternatives=(),
+        equation="no law was found",
+        parameters=(),
+        rms_torque=rms,
+        evidence=float(0.5 * np.sum(weights[:, joint] > 0) * (beyond[joint] - 1 - np.log(beyond[joint]))),
+        summary=f"Joint {joint + 1} is {np.sqrt(beyond[joint]):.1f} times its noise off the simulation"
+        + ("" if whole else f" at times, in {trace.name} first from {when[0][0]:.2f} s to {when[0][1]:.2f} s")
+        + "; neither a named effect nor a free curve explains it.",
+        terms=(),
+    )
+
+
+def hum(
+    recordings: Sequence[Signals],
+    active: Sequence[bool],
+    std: Float[np.ndarray, " dof"],
+    lowest: float = _LOWEST,
+) -> Finding | None:
+    """Lines of one frequency in the measured torque that stand alone in its spectrum; None if there are none.
+
+    Args:
+        recordings: all of them.
+        active: which are of the arm in question; what a healthy one hums too is not told.
+        std: deviation of each joint's noise [N m].
+        lowest: frequency from which lines are looked for [Hz].
+    """
+    pairs = [(one, _lines(one, std, lowest), on) for one, on in zip(recordings, active, strict=True)]
+    usual = [line for _, lines, on in pairs if not on for line in lines.values()]
+    new = [
+        (one, {j: line for j, line in lines.items() if not any(map(line.is_at, usual))})
+        for one, lines, on in pairs
+        if on
+    ]
+    if not any(lines for _, lines in new):
+        return None
+    clearest = max((line for _, lines in new for line in lines.values()), key=lambda line: line.alone)
+    same = [(one, {j: line for j, line in lines.items() if line.is_at(clearest)}) for one, lines in new]
+    each = sorted(((j, line) for _, x in same for j, line in x.items()), key=lambda one: one[1].amplitude)
+    loudest = dict(sorted(dict(each).items()))  # of each joint the last
+    rms = np.zeros(len(std))
+    rms[list(loudest)] = [line.amplitude / np.sqrt(2) for line in loudest.values()]
+    told = [("frequency", None, clearest.frequency, clearest.spread, "Hz")]
+    told += [("amplitude", j + 1, line.amplitude, line.deviation, "N·m") for j, line in loudest.items()]
+    return Finding(
+        effect="unknown",
+        joints=tuple(loudest),
+        recordings=tuple(one.name for one, lines in same if lines),
+        intervals=None,
+        confidence=1 - 1 / clearest.alone,
+        alternatives=(),
+        equation="tau = amplitude * sin(2 pi frequency t + phase)",
+        parameters=tuple(
+            dict(zip(("name", "joint", "value", "std", "unit"), one, strict=True)) for one in told
+        ),
+        rms_torque=rms,
+        evidence=sum(0.5 * (line.amplitude / line.deviation) ** 2 for _, x in same for line in x.values()),
+        summary=f"The measured torque of joint {', '.join(str(j + 1) for j in loudest)} hums at "
+        f"{clearest.frequency:.2f} Hz whatever the arm does, with up to {np.sqrt(2) * rms.max():.2g} N·m.",
+        terms=(),
+    )
+
+
+def _lines(one: Signals, std: Float[np.ndarray, " dof"], lowest: float) -> dict[int, "_Line"]:
+    """Those of a recording that count, by joint."""
+    if one.tau is None:
+        return {}
+    least = _HEARD * np.sqrt(2) * np.maximum(white_noise(one.tau), std)
+    found = {j: _line(x, one.rate, lowest) for j, x in enumerate(one.tau.T)}
+    return {j: line for j, line in found.items() if line is not None and line.amplitude > least[j]}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Line:
+    """A sine in noise."""
+
+    frequency: float
+    """[Hz]"""
+    spread: float
+    """Standard deviation of the frequency [Hz]."""
+    amplitude: float
+    deviation: float
+    """Of the amplitude."""
+    alone: float
+    """Power over the greatest nearby."""
+    resolved: float
+    """Distance from which another is another [Hz]."""
+
+    def is_at(self, other: "_Line") -> bool:
+        """Whether the other has the same frequency."""
+        return abs(self.frequency - other.frequency) < self.resolved + other.resolved
+
+
+def _line(x: Float[np.ndarray, " time"], rate: float, lowest: float) -> _Line | None:
+    """The line that stands out most."""
+    step = rate / len(x)
+    wide = int(_NEARBY / step)
+    half = (wide - _LOBE - 1) // 2
+    if half < 2 * _LOBE:
+        return None  # too short to tell a line from what is beside it
+    window = hann(len(x), sym=False)
+    sine = 2 * np.abs(np.fft.rfft((x - x.mean()) * window)) / window.sum()
+    # the greatest on either side, beyond the line's own bins
+    most = scipy.ndimage.maximum_filter1d(np.pad(sine, 2 * wide), 2 * half + 1, mode="constant")
+    below, above = (most[2 * wide + side * (_LOBE + 1 + half) :][: len(sine)] for side in (-1, 1))
+    alone = (sine / np.maximum(np.maximum(below, above), 1e-300)) ** 2
+    alone[: int(np.ceil(lowest / step))] = 0.0
+    alone[-_LOBE:] = 0.0
+    top = int(alone.argmax())
+    if alone[top] < _ALONE:
+        return None
+    # between bins, as Hann's window has it
+    side = 1 if sine[top + 1] > sine[top - 1] else -1
+    ratio = sine[top + side] / sine[top]
+    off = float(np.clip((2 * ratio - 1) / (ratio + 1), 0.0, 0.5))
+    amplitude = float(sine[top] * (1 - off**2) / np.sinc(off))
+    beside = np.r_[sine[max(0, top - wide) : top - _LOBE], sine[top + _LOBE + 1 : top + wide]]
+    deviation = float(np.sqrt(np.median(beside**2) / np.log(4)))
+    spread = step * deviation / amplitude  # by simulation; a little less where the line is strong
+    return _Line((top + side * off) * step, spread, amplitude, deviation, float(alone[top]), step)

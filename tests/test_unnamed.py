@@ -1,0 +1,101 @@
+"""What no effect explains: lines in the spectrum of the torque, found where they are and nowhere else."""
+
+import jax
+import numpy as np
+import pytest
+from jaxpanda_kernels import rnea
+from scipy.signal import lfilter
+
+from jaxpanda import Arm, Recording
+from jaxpanda.diagnosis import diagnose
+from jaxpanda.diagnosis.unnamed import hum
+from jaxpanda.signals import prepare
+
+ARM = Arm.panda()
+LOAD = jax.jit(jax.vmap(lambda q, qd, qdd: rnea(ARM.chain, ARM.standard, q, qd, qdd)))
+RATE, SECONDS, NOISE = 250.0, 16.0, 0.05
+
+
+def recording(seed: int = 0, added=lambda t, q, qd: 0.0, name: str = "motion.csv") -> Recording:
+    """One motion with coloured noise of the torque, and what is added to it."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0, SECONDS, 1 / RATE)
+    w = 2 * np.pi * np.array([0.1, 0.2, 0.4])[:, None]
+    a, b = rng.normal(0, 0.12, (2, 3, 7))
+    q = 0.5 * np.asarray(ARM.lower + ARM.upper) + np.sin(w * t).T @ a + np.cos(w * t).T @ b
+    qd = (w * np.cos(w * t)).T @ a - (w * np.sin(w * t)).T @ b
+    qdd = -(w**2 * np.sin(w * t)).T @ a - (w**2 * np.cos(w * t)).T @ b
+    rng = np.random.default_rng(100 + seed)
+    slow = lfilter([np.sqrt(1 - 0.9**2)], [1, -0.9], rng.normal(size=q.shape), axis=0)
+    noise = NOISE * np.sqrt(0.5) * (slow + rng.normal(size=q.shape))
+    tau = np.asarray(LOAD(q, qd, qdd)) + noise + added(t[:, None], q, qd)
+    return Recording(name, t, q + 1e-5 * rng.normal(size=q.shape), qd=qd, tau=tau)
+
+
+def heard(*recordings: Recording, active: tuple[bool, ...] | None = None):
+    return hum([prepare(one) for one in recordings], active or (True,) * len(recordings), np.full(7, NOISE))
+
+
+def at_joints(amplitude, frequency, *joints):
+    where = np.isin(np.arange(7), joints)
+    return lambda t, q, qd: amplitude * np.sin(2 * np.pi * frequency * t + 1.0) * where
+
+
+@pytest.mark.parametrize("frequency", [7.3, 60.02])
+def test_a_hum_is_heard_where_it_is_in_and_beyond_the_band(frequency):
+    found = heard(recording(added=at_joints(0.1, frequency, 1, 4)))
+    assert found is not None
+    assert found.joints == (1, 4)
+    told = [(p["value"], p["std"]) for p in found.parameters]
+    for (value, std), true in zip(told, (frequency, 0.1, 0.1), strict=True):
+        assert abs(value - true) < 4 * std
+        assert std < 0.05 * true
+    np.testing.assert_allclose(found.rms_torque[[1, 4]], 0.1 / np.sqrt(2), rtol=0.1)
+
+
+def test_its_deviations_hold_the_truth():
+    errors = []
+    for seed in range(30):
+        found = heard(recording(seed, at_joints(0.08, 31.0 + 0.37 * seed, 2)))
+        assert found is not None
+        frequency, amplitude = found.parameters
+        errors.append(
+            [
+                (frequency["value"] - 31.0 - 0.37 * seed) / frequency["std"],
+                (amplitude["value"] - 0.08) / amplitude["std"],
+            ]
+        )
+    assert np.all(np.mean(np.abs(errors) < 1.96, 0) > 0.8)
+
+
+def test_noise_is_no_hum():
+    assert [heard(recording(seed)) for seed in range(12)] == [None] * 12
+
+
+def test_what_depends_on_the_motion_is_no_hum():
+    ripple = lambda t, q, qd: 0.5 * np.sin(160 * q) * (np.arange(7) == 3)
+    assert heard(recording(added=ripple)) is None
+    rubs = lambda t, q, qd: 2.0 * np.sign(qd)
+    assert heard(recording(added=rubs)) is None
+
+
+def test_what_a_healthy_arm_hummed_before_is_not_missing():
+    hums, healthy = at_joints(0.1, 50.0, 1), recording(1, at_joints(0.1, 50.0, 1), "healthy.csv")
+    assert heard(recording(0, hums), healthy, active=(True, False)) is None
+    assert heard(recording(0, hums), recording(1, name="healthy.csv"), active=(True, False)) is not None
+
+
+@pytest.mark.slow
+def test_a_diagnosis_says_that_it_hums_beside_what_it_finds(tmp_path):
+    from jaxpanda.export import panda_mjcf
+
+    (tmp_path / "arm.xml").write_text(panda_mjcf(), "utf-8")
+    rubs, hums = (lambda t, q, qd: 0.5 * np.sign(qd) * (np.arange(7) == 3)), at_joints(0.1, 50.0, 1)
+    both = recording(added=lambda t, q, qd: rubs(t, q, qd) + hums(t, q, qd))
+    found = diagnose(tmp_path / "arm.xml", [both])
+    assert [(one.effect, one.joints) for one in found.findings] == [
+        ("coulomb_friction", (3,)),
+        ("unknown", (1,)),
+    ]
+    assert found.verdict == "partly_explained"
+    assert "50.0" in found.findings[1].summary
