@@ -44,7 +44,14 @@ from .mjcf import MjcfSource, com_from_standard, from_mjcf, move_standard, stand
 from .recordings import Recording
 from .recordings import load as load_recording
 from .signals import derivatives, prepare, zero_phase
-from .validation import arm_model, assert_mjx_supported, feedback_gains, jit_mjx, mjx_package
+from .validation import (
+    arm_model,
+    assert_mjx_supported,
+    feedback_gains,
+    has_run_away,
+    jit_mjx,
+    mjx_package,
+)
 
 CUTOFF = 20.0
 """Low-pass of motion and torque, recorded and simulated, at most [Hz]."""
@@ -399,6 +406,9 @@ def _in_mujoco(bare: mujoco.MjModel, plant: Plant, gains: Gains, task: Task) -> 
             added[k] = stiffness * (motion[k] - data.qpos) + damping * (speed[k] - data.qvel)
             tau[k] = data.qfrc_applied = torque[k] + added[k]
             mujoco.mj_step(model, data)
+            if has_run_away(data):
+                shown[k:] = np.nan
+                break
         return shown, tau, added
     leaves, shape = jax.tree.flatten((plant, gains))
     rows = np.concatenate([times[:, None], motion, speed, torque], 1)
@@ -406,6 +416,9 @@ def _in_mujoco(bare: mujoco.MjModel, plant: Plant, gains: Gains, task: Task) -> 
         carry, out = _packed(leaves, carry, rows[k], data.qpos, data.qvel, shape=shape, dt=dt)
         data.qfrc_applied, model.dof_damping[:], shown[k], tau[k], added[k] = np.asarray(out)
         mujoco.mj_step(model, data)
+        if has_run_away(data):
+            shown[k:] = np.nan
+            break
     return shown, tau, added
 
 

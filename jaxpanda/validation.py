@@ -513,6 +513,12 @@ def _result(
     return Rollout(_rms(errors), _rms(np.concatenate(feedback)), seconds, tuple(motions))
 
 
+def has_run_away(data: mujoco.MjData) -> bool:
+    """Whether the last step met numbers that are no motion: MuJoCo would start over where it began, and go on."""
+    bad = mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC
+    return any(data.warning[int(one)].number for one in bad)
+
+
 def _rollout_mujoco(bare: mujoco.MjModel, tasks: Sequence[_Task], law: _Feedback) -> Rollout | None:
     """The model under the recorded torque in C MuJoCo."""
     start = time.perf_counter()
@@ -529,6 +535,8 @@ def _rollout_mujoco(bare: mujoco.MjModel, tasks: Sequence[_Task], law: _Feedback
             friction = np.asarray(resistance(jnp.array(data.qvel)))
             data.qfrc_applied = task.tau[k] + added[k] - friction
             mujoco.mj_step(bare, data)
+            if has_run_away(data):
+                return None
         motions.append(q)
         feedback.append(added)
     return _result(motions, feedback, tasks, time.perf_counter() - start)

@@ -4,6 +4,7 @@ Recordings come from MuJoCo's C engine: the project's virtual arm, and the conce
 with what is tested.
 """
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -263,3 +264,13 @@ def test_a_concealed_effect_s_own_numbers_bring_the_simulation_to_the_recorded_m
     result = rollout.compare(corrected(arm, found), source, load(tmp_path / name))
     before, after = (np.linalg.norm(result[f"rmse_rad_{when}"]) for when in ("before", "after"))
     assert after < share * before
+
+
+@pytest.mark.parametrize("laws", [(), ((CoulombFriction(0, 0.05), [0.3]),)])
+def test_a_simulation_that_runs_away_ends_there_and_is_told(moved, laws, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves MUJOCO_LOG.TXT
+    arm, source = two_links()
+    wild = dataclasses.replace(moved, tau=1e14 * np.asarray(moved.tau))
+    compared = rollout.compare(corrected(arm, *laws), source, wild)
+    assert compared["rmse_rad_before"] is None
+    assert compared["rmse_rad_after"] is None
