@@ -408,13 +408,28 @@ def instead(problem: Problem, state: State, i: int) -> list[Proposal]:
             int(j) for j in np.flatnonzero(shares(state)[i] > _FELT)
         }  # fmt: skip
         scanned = ranked(problem, without(state, i), state.noise, acts)
-        if isinstance(effect, PayloadChange):  # the scan of windows does not see what other recordings say
-            best, deviation = _single(problem, without(state, i), state.noise, effect)
-            own = Proposal(effect, best - _PAID, best, deviation, first_steps(effect))
-            scanned = sorted([own, *scanned], key=lambda p: -p.evidence)
+        own = _own(problem, state, i, scanned)
+        if own is not None:
+            scanned = sorted([own, *(p for p in scanned if p.key != own.key)], key=lambda p: -p.evidence)
         cache[key] = (scanned, state)  # the state is kept, lest its parts' identities be used again
     held = {t.key for t in others if not t.effect.repeats}
     return [p for p in cache[key][0] if p.key not in held]
+
+
+def _own(problem: Problem, state: State, i: int, scanned: Sequence[Proposal]) -> Proposal | None:
+    """A term's own shape in its place, if it is likelier than what the scan found of its kind.
+
+    What the scan finds is refined among the first only, and a gap's or a change of payload's best shape may lie
+    far from those of the grid.
+    """
+    effect, rest, noise = state.terms[i].effect, without(state, i), state.noise
+    best, deviation = _single(problem, rest, noise, effect)
+    found = next((p for p in scanned if p.key == state.terms[i].key), None)
+    if found is not None and found.best >= best:
+        return None
+    evidence = best - _PAID if found is None else found.evidence + best - found.best
+    own = Proposal(effect, evidence, best, deviation, first_steps(effect))
+    return own if is_dissipative(problem, rest, noise, own) and has_play(problem, rest, noise, own) else None
 
 
 def prune(problem: Problem, state: State, say: Any) -> State:
