@@ -1,5 +1,7 @@
 """What makes a diagnosis fast changes none of its answers."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -7,12 +9,15 @@ import scipy.linalg
 
 from jaxpanda import Arm, Recording
 from jaxpanda import signals as signals_
+from jaxpanda.diagnosis import search
+from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.search import _score
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Channels, joint_columns
 from jaxpanda.effects import effect as effect_
+from jaxpanda.effects.drive import TorqueRipple
 from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
 
@@ -93,3 +98,16 @@ def test_noise_is_estimated_anew_only_where_a_term_acts(problem: Problem):
     without, beside = problem.noise(()), problem.noise((term,))
     assert np.array_equal(np.delete(without.sigma, 3), np.delete(beside.sigma, 3))
     assert without.sigma[3] != beside.sigma[3]
+
+
+def test_a_term_defends_its_place_with_its_own_shape(problem: Problem):
+    """What the scan finds of its kind is not always refined; the term's shape may be likelier by far."""
+    state = search.with_terms(problem, [problem.term(TorqueRipple(3, 33.7, "one"), np.array([1.0, 1.0]))])
+    here = search.held_evidence(problem, state, 0)
+    found = Proposal(TorqueRipple(3, 40.0, "one"), here - 107.0, here - 100.0, np.ones(2), (0.01,))
+    own = search._own(problem, state, 0, [found])
+    assert own is not None
+    assert own.effect == state.terms[0].effect
+    assert own.best == pytest.approx(here)
+    assert own.evidence == pytest.approx(here - 7.0)  # what the scan pays for its search
+    assert search._own(problem, state, 0, [dataclasses.replace(found, best=here + 1.0)]) is None
