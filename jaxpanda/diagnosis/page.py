@@ -16,6 +16,7 @@ from .decide import coefficients
 from .diagnosis import NEXT_MOTION, Diagnosis
 from .finding import Finding
 from .localise import REGIMES, Localisation, lag_profile, order_spectrum, since_reversal
+from .unnamed import sines
 
 _POINTS = 900
 """Points of a cloud, and stretches of a curve, that a figure draws."""
@@ -111,7 +112,7 @@ def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -
     for p in one.parameters:
         ends = [number(p["value"] + side * 1.96 * p["std"]) for side in (-1, 1)]
         interval = " … ".join(ends) if p["std"] else "–"
-        rows.append([p["name"], str(p["joint"]), number(p["value"]), interval, p["unit"]])
+        rows.append([p["name"], str(p["joint"] or "-"), number(p["value"]), interval, p["unit"]])
     if rows:
         tables.append(Table(["parameter", "joint", "value", "95 % interval", "unit"], rows))
     felt = ["rms", *(number(float(v), 3) for v in one.rms_torque)]
@@ -173,6 +174,7 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
     trace = problem.traces[shown]
     delayed = one.effect == "time_delay"
     ordered = one.effect == "torque_ripple"
+    hums = next((p["value"] for p in one.parameters if not one.terms and p["name"] == "frequency"), None)
 
     def draw(canvas: Any) -> None:
         left, right = canvas.subplots(1, 2, width_ratios=[1, 1.35])
@@ -186,13 +188,23 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
             left.vlines(orders, 0, amplitude, color=_AFTER, linewidth=0.8)
             left.set(xlabel="order: periods in a turn of the joint", ylabel="amplitude [N·m]")
             left.set_title("order spectrum of the residual")
+        elif hums is not None:
+            tau = np.asarray(trace.signals.tau)[:, joint]
+            frequencies = np.fft.rfftfreq(len(tau), 1 / trace.signals.rate)
+            left.semilogy(frequencies, sines(tau), color=_AFTER, linewidth=0.8)
+            left.axvline(hums, color=_FIT, linewidth=0.8, linestyle=":")
+            left.set(
+                xlabel="frequency [Hz]", ylabel="amplitude [N·m]", xlim=(0, min(3 * hums, frequencies[-1]))
+            )
+            left.set_title("spectrum of the measured torque")
         else:
             _draw_regime(left, xs, y, f)
             left.set(xlabel=label, ylabel=f"residual of {names[joint]} [N·m]")
             left.set_title("what is left without this finding, and its law")
         time = trace.motion.time[rows[shown]]
         _trail(right, time, lefts[shown], color="0.6", label="residual without this finding")
-        _trail(right, time, fits[shown], color=_FIT, label="what it explains")
+        if one.terms:
+            _trail(right, time, fits[shown], color=_FIT, label="what it explains")
         for a, b in one.intervals or ():
             right.axvspan(a, b, color=_BEFORE, alpha=0.15, linewidth=0)
         right.set(xlabel=f"time in {_short(trace.name)} [s]", ylabel="[N·m]")
@@ -201,7 +213,9 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
 
     return Figure(
         draw,
-        f"Why: the residual of {names[joint]} against {label if not delayed else 'lag'}",
+        f"Why: the residual of {names[joint]} against {'lag' if delayed else label}"
+        if hums is None
+        else f"Why: what {names[joint]} measures has a line at one frequency",
         (10.0, 3.4),
         None,
     )

@@ -120,7 +120,8 @@ def hum(
         ),
         rms_torque=rms,
         evidence=sum(0.5 * (line.amplitude / line.deviation) ** 2 for _, x in same for line in x.values()),
-        summary=f"The measured torque of joint {', '.join(str(j + 1) for j in loudest)} hums at "
+        summary=f"The measured torque of joint{'s' * (len(loudest) > 1)} "
+        f"{', '.join(str(j + 1) for j in loudest)} hums at "
         f"{clearest.frequency:.2f} Hz whatever the arm does, with up to {np.sqrt(2) * rms.max():.2g} N·m.",
         terms=(),
     )
@@ -156,6 +157,12 @@ class _Line:
         return abs(self.frequency - other.frequency) < self.resolved + other.resolved
 
 
+def sines(x: Float[np.ndarray, " time"]) -> Float[np.ndarray, " frequencies"]:
+    """Amplitude of the sine at each of the frequencies of `np.fft.rfftfreq`, under Hann's window."""
+    window = hann(len(x), sym=False)
+    return 2 * np.abs(np.fft.rfft((x - x.mean()) * window)) / window.sum()
+
+
 def _line(x: Float[np.ndarray, " time"], rate: float, lowest: float) -> _Line | None:
     """The line that stands out most."""
     step = rate / len(x)
@@ -163,8 +170,7 @@ def _line(x: Float[np.ndarray, " time"], rate: float, lowest: float) -> _Line | 
     half = (wide - _LOBE - 1) // 2
     if half < 2 * _LOBE:
         return None  # too short to tell a line from what is beside it
-    window = hann(len(x), sym=False)
-    sine = 2 * np.abs(np.fft.rfft((x - x.mean()) * window)) / window.sum()
+    sine = sines(x)
     # the greatest on either side, beyond the line's own bins
     most = scipy.ndimage.maximum_filter1d(np.pad(sine, 2 * wide), 2 * half + 1, mode="constant")
     below, above = (most[2 * wide + side * (_LOBE + 1 + half) :][: len(sine)] for side in (-1, 1))
