@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxpanda_kernels import Chain, inertia
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
+
+from jaxpanda import Arm
 
 
 def random_chain(seed: int, dof: int) -> Chain:
@@ -35,6 +38,23 @@ def states(seed: int, count: int, dof: int) -> tuple[jax.Array, jax.Array, jax.A
     scales = (np.pi, 2.0, 5.0)
     q, qd, qdd = (jnp.asarray(rng.uniform(-s, s, (count, dof))) for s in scales)
     return q, qd, qdd
+
+
+def excitation(arm: Arm, t: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A sum of sines about the middle of the range, with its derivatives, each [time, dof]."""
+    rng = np.random.default_rng(seed)
+    w = 2 * np.pi * np.array([0.1, 0.2, 0.4])[:, None]
+    a, b = rng.normal(0, 0.12, (2, 3, arm.dof))
+    q = 0.5 * np.asarray(arm.lower + arm.upper) + np.sin(w * t).T @ a + np.cos(w * t).T @ b
+    qd = (w * np.cos(w * t)).T @ a - (w * np.sin(w * t)).T @ b
+    qdd = -(w**2 * np.sin(w * t)).T @ a - (w**2 * np.cos(w * t)).T @ b
+    return q, qd, qdd
+
+
+def half_correlated(rng: np.random.Generator, shape: tuple[int, ...], keep: float) -> np.ndarray:
+    """Noise of unit variance: half of it white, half keeps this share of itself from sample to sample."""
+    slow = lfilter([np.sqrt(1 - keep**2)], [1, -keep], rng.normal(size=shape), axis=0)
+    return np.sqrt(0.5) * (slow + rng.normal(size=shape))
 
 
 def _numbers(values: Any) -> str:

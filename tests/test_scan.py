@@ -105,9 +105,10 @@ def test_a_term_defends_its_place_with_its_own_shape(problem: Problem):
     state = search.with_terms(problem, [problem.term(TorqueRipple(3, 33.7, "one"), np.array([1.0, 1.0]))])
     here = search.held_evidence(problem, state, 0)
     found = Proposal(TorqueRipple(3, 40.0, "one"), here - 107.0, here - 100.0, np.ones(2), (0.01,))
-    own = search._own(problem, state, 0, [found])
+    at = problem, search.without(state, 0), state.noise, state.terms[0].effect
+    own = search._own(*at, [found])
     assert own is not None
     assert own.effect == state.terms[0].effect
     assert own.best == pytest.approx(here)
     assert own.evidence == pytest.approx(here - 7.0)  # what the scan pays for its search
-    assert search._own(problem, state, 0, [dataclasses.replace(found, best=here + 1.0)]) is None
+    assert search._own(*at, [dataclasses.replace(found, best=here + 1.0)]) is None

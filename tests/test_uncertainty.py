@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from helpers import excitation, half_correlated
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis.events import Proposal
@@ -22,16 +22,10 @@ AMPLITUDE, ORDER = 0.1, 101.0
 
 def recording(seed: int, law) -> Recording:
     """One motion of the Panda with correlated noise of its own draw; `law` acts in the fifth joint."""
-    rng = np.random.default_rng(7)
     t = np.arange(0, 10, 0.005)
-    w = 2 * np.pi * np.array([0.1, 0.2, 0.4])[:, None]
-    a, b = rng.normal(0, 0.12, (2, 3, 7))
-    q = 0.5 * np.asarray(ARM.lower + ARM.upper) + np.sin(w * t).T @ a + np.cos(w * t).T @ b
-    qd = (w * np.cos(w * t)).T @ a - (w * np.sin(w * t)).T @ b
-    qdd = -(w**2 * np.sin(w * t)).T @ a - (w**2 * np.cos(w * t)).T @ b
+    q, qd, qdd = excitation(ARM, t, 7)
     rng = np.random.default_rng(1000 + seed)
-    slow = lfilter([np.sqrt(1 - CORRELATED**2)], [1, -CORRELATED], rng.normal(size=q.shape), axis=0)
-    noise = NOISE * np.sqrt(0.5) * (slow + rng.normal(size=q.shape))
+    noise = NOISE * half_correlated(rng, q.shape, CORRELATED)
     tau = Motion(ARM, t, q, qd, qdd, np.zeros_like(q)).load + noise
     tau[:, 4] += law(q[:, 4], qd[:, 4])
     return Recording("motion.csv", t, q + 1e-5 * rng.normal(size=q.shape), qd=qd, tau=tau)

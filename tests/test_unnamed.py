@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 import pytest
+from helpers import excitation, half_correlated
 from jaxpanda_kernels import rnea
-from scipy.signal import lfilter
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose
@@ -18,16 +18,10 @@ RATE, SECONDS, NOISE = 250.0, 16.0, 0.05
 
 def recording(seed: int = 0, added=lambda t, q, qd: 0.0, name: str = "motion.csv") -> Recording:
     """One motion with coloured noise of the torque, and what is added to it."""
-    rng = np.random.default_rng(3)
     t = np.arange(0, SECONDS, 1 / RATE)
-    w = 2 * np.pi * np.array([0.1, 0.2, 0.4])[:, None]
-    a, b = rng.normal(0, 0.12, (2, 3, 7))
-    q = 0.5 * np.asarray(ARM.lower + ARM.upper) + np.sin(w * t).T @ a + np.cos(w * t).T @ b
-    qd = (w * np.cos(w * t)).T @ a - (w * np.sin(w * t)).T @ b
-    qdd = -(w**2 * np.sin(w * t)).T @ a - (w**2 * np.cos(w * t)).T @ b
+    q, qd, qdd = excitation(ARM, t, 3)
     rng = np.random.default_rng(100 + seed)
-    slow = lfilter([np.sqrt(1 - 0.9**2)], [1, -0.9], rng.normal(size=q.shape), axis=0)
-    noise = NOISE * np.sqrt(0.5) * (slow + rng.normal(size=q.shape))
+    noise = NOISE * half_correlated(rng, q.shape, 0.9)
     tau = np.asarray(LOAD(q, qd, qdd)) + noise + added(t[:, None], q, qd)
     return Recording(name, t, q + 1e-5 * rng.normal(size=q.shape), qd=qd, tau=tau)
 

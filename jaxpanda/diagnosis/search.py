@@ -407,8 +407,9 @@ def instead(problem: Problem, state: State, i: int) -> list[Proposal]:
         acts = set(effect.joints) if isinstance(effect, AbstractJointEffect) else {
             int(j) for j in np.flatnonzero(shares(state)[i] > _FELT)
         }  # fmt: skip
-        scanned = ranked(problem, without(state, i), state.noise, acts)
-        own = _own(problem, state, i, scanned)
+        rest = without(state, i)
+        scanned = ranked(problem, rest, state.noise, acts)
+        own = _own(problem, rest, state.noise, effect, scanned)
         if own is not None:
             scanned = sorted([own, *(p for p in scanned if p.key != own.key)], key=lambda p: -p.evidence)
         cache[key] = (scanned, state)  # the state is kept, lest its parts' identities be used again
@@ -416,15 +417,16 @@ def instead(problem: Problem, state: State, i: int) -> list[Proposal]:
     return [p for p in cache[key][0] if p.key not in held]
 
 
-def _own(problem: Problem, state: State, i: int, scanned: Sequence[Proposal]) -> Proposal | None:
+def _own(
+    problem: Problem, rest: Design, noise: Noise, effect: AbstractEffect, scanned: Sequence[Proposal]
+) -> Proposal | None:
     """A term's own shape in its place, if it is likelier than what the scan found of its kind.
 
     What the scan finds is refined among the first only, and a gap's or a change of payload's best shape may lie
     far from those of the grid.
     """
-    effect, rest, noise = state.terms[i].effect, without(state, i), state.noise
     best, deviation = _single(problem, rest, noise, effect)
-    found = next((p for p in scanned if p.key == state.terms[i].key), None)
+    found = next((p for p in scanned if p.key == (effect.name, effect.joints)), None)
     if found is not None and found.best >= best:
         return None
     evidence = best - _PAID if found is None else found.evidence + best - found.best

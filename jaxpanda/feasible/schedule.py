@@ -101,9 +101,8 @@ def run(
     def keep(first: int, pieces: list[list[Array]]) -> None:
         """Copy what is wanted of a chunk into the outcome."""
         for at in range(first, min(first + chunk, starts), _PIECE):
-            for whole, part in zip(
-                outcome, pieces.pop(0), strict=True
-            ):  # an array keeps its copy on the host
+            piece = pieces.pop(0)  # an array keeps its copy on the host as long as it lives
+            for whole, part in zip(outcome, piece, strict=True):
                 whole[at : at + len(part)] = np.asarray(part)[: starts - at]
 
     def finish(first: int, chunks: list[Future[list[list[Array]]]]) -> None:
