@@ -178,7 +178,7 @@ class Corrected(eqx.Module):
             if effect is None:
                 continue
             if isinstance(effect, AbstractJointEffect):
-                tau[:, effect.joints[0]] += joint_columns([effect], channels, motion.dt)[0] @ np.asarray(c)
+                tau[:, effect.joints[0]] += joint_columns([effect], channels, motion.dt)[:, 0] @ np.asarray(c)
             else:
                 tau = tau + effect.over(motion) @ np.asarray(c)  # pyright: ignore
         return tau

@@ -16,12 +16,13 @@ import pytest
 from jaxpanda import Arm, InputError, Recording
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
-from jaxpanda.diagnosis.decide import called, titles
+from jaxpanda.diagnosis.decide import titles
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check, inertial_spread
 from jaxpanda.diagnosis.noise import autoregression
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
+from jaxpanda.diagnosis.rivals import called
 from jaxpanda.diagnosis.search import transferable, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion

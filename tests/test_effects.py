@@ -81,7 +81,7 @@ def shapes(arm: Arm):
 def columns(effect, motion: Motion, channels: Channels) -> np.ndarray:
     if isinstance(effect, AbstractJointEffect):
         wide = np.zeros((motion.samples, motion.dof, len(effect.coefficients)))
-        wide[:, effect.joints[0]] = joint_columns([effect], channels, motion.dt)[0]
+        wide[:, effect.joints[0]] = joint_columns([effect], channels, motion.dt)[:, 0]
         return wide
     return effect.over(motion)
 
@@ -128,12 +128,12 @@ def test_derivatives_of_effects_without_memory_exist_at_rest(arm):
 
 def test_friction_takes_energy_out(arm, motion, channels):
     for effect in (CoulombFriction(2, 0.01), PreslidingHysteresis(2, 0.01, "dahl only")):
-        torque = joint_columns([effect], channels, motion.dt)[0, :, 0]
+        torque = joint_columns([effect], channels, motion.dt)[:, 0, 0]
         assert torque @ motion.qd[:, 2] > 0
 
 
 def test_presliding_friction_goes_over_into_coulomb_friction_beyond_its_breakaway_distance(motion, channels):
-    dahl = joint_columns([PreslidingHysteresis(3, 1e-4, "dahl only")], channels, motion.dt)[0, :, 0]
+    dahl = joint_columns([PreslidingHysteresis(3, 1e-4, "dahl only")], channels, motion.dt)[:, 0, 0]
     sliding = np.abs(motion.qd[:, 3]) > 0.2
     np.testing.assert_allclose(dahl[sliding], np.sign(motion.qd[sliding, 3]), atol=1e-3)
 
@@ -203,6 +203,19 @@ def test_a_delay_reproduces_the_shifted_torque_where_it_was_linearised(motion):
     np.testing.assert_allclose(shifted[2:], motion.torque[:-2], atol=1e-9)
 
 
+def test_torque_may_lead_and_a_single_joint_may_lag(motion):
+    d = 0.02
+    ahead = motion.torque + TimeDelay(7, d, "whole ahead").over(motion)[..., 0] * d
+    np.testing.assert_allclose(ahead[:-2], motion.torque[2:], atol=1e-9)
+    late = TimeDelay(7, d, "whole", 3)
+    one = motion.torque + late.over(motion)[..., 0] * d
+    np.testing.assert_allclose(one[2:, 3], motion.torque[:-2, 3], atol=1e-9)
+    np.testing.assert_array_equal(np.delete(one, 3, 1), np.delete(motion.torque, 3, 1))
+    assert late.joints == (3,)
+    told = dataclasses.replace(late, form="whole ahead").parameters(np.array([d]), np.eye(1))
+    assert [(p["joint"], p["value"]) for p in told] == [(4, -d)]
+
+
 def test_a_stiff_joint_deflects_by_its_torque_over_its_stiffness(motion):
     K = 2e5
     found = JointElasticity(1, K, 0.2).over(motion)[50:-50, :, 0]
@@ -241,7 +254,7 @@ def test_torque_sensors_show_what_the_columns_add(arm, motion, channels):
         if effect.acts_on != "torque":
             continue
         if effect.name == "time_delay":
-            effect = TimeDelay(effect.dof, effect.around, "whole")
+            effect = dataclasses.replace(effect, form=effect.form.replace("smooth", "whole"))
         d = 0.02  # a delay of two samples is where its column is exact
         c = jnp.full(1, -effect.around if effect.name == "time_delay" else d)
         c = jnp.linspace(d, 2 * d, len(effect.coefficients)) if effect.name != "time_delay" else -c

@@ -32,6 +32,6 @@ def test_what_healthy_recordings_show_may_be_refitted_in_all_recordings():
     for columns in problem.nuisance:
         np.testing.assert_allclose(columns[:, 3, -1], 0.5, atol=1e-6)
         assert not np.any(columns[:, [0, 1, 2, 4, 5, 6], -1])
-    news = problem.full_columns([TorqueOffset(3)])
+    news = problem.full_columns(TorqueOffset(3))
     assert np.any(news[0])
     assert not np.any(news[1])  # an effect that is searched for acts in the suspect recording alone

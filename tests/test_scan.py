@@ -46,7 +46,7 @@ def test_a_recording_of_another_length_compiles_nothing_new():
     joint_columns(effects, channels(4500), 0.002)
     before = effect_._advance._cache_size()
     for samples in (50, 2048, 5000):
-        assert joint_columns(effects, channels(samples), 0.002).shape == (2, samples, 1)
+        assert joint_columns(effects, channels(samples), 0.002).shape == (samples, 2, 1)
     assert effect_._advance._cache_size() == before
 
 
@@ -54,7 +54,7 @@ def test_a_recording_of_another_length_compiles_nothing_new():
 def test_columns_by_stretches_are_those_of_the_whole_recording(effect):
     s = channels(20000)
     whole = effect.columns(jax.tree.map(jax.numpy.asarray, s), 0.002)
-    assert joint_columns([effect], s, 0.002)[0] == pytest.approx(np.asarray(whole), abs=1e-12)
+    assert joint_columns([effect], s, 0.002)[:, 0] == pytest.approx(np.asarray(whole), abs=1e-12)
 
 
 def test_the_low_pass_by_products_is_the_recursive_one(problem: Problem):

@@ -23,7 +23,7 @@ def _terms(problem: Problem, effects: Sequence[AbstractEffect | Term]) -> list[T
         if isinstance(effect, Term):
             out.append(effect)
             continue
-        columns = np.concatenate(problem.full_columns([effect]))
+        columns = np.concatenate(problem.full_columns(effect))
         size = np.sqrt(np.mean((columns / noise[:, None]) ** 2, 0)).max(0)
         physical = [np.inf if k.scale is None else 10 * k.scale for k in effect.coefficients]
         out.append(problem.term(effect, np.minimum(_LOOSE / np.maximum(size, 1e-9), physical)))

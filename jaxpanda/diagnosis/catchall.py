@@ -1,10 +1,12 @@
 """Free-form hypotheses for each joint: they compete with the catalogue, so that it is not believed blindly."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
 
 from ..effects.unknown import FORMS, Unknown
+from .host import parallel
 from .library import Candidates, columns_of
 from .traces import Trace
 
@@ -26,20 +28,22 @@ _KINDS = {
 def build(traces: Sequence[Trace]) -> list[Candidates]:
     """Every free form at every joint, with knots where the recordings have been."""
     dof = traces[0].motion.dof
-    out = []
+    alike: dict[tuple, list[Unknown]] = defaultdict(list)
     for form in FORMS:
-        effects = []
         for j in range(dof):
             for k in range(dof) if form.endswith("_k") else (j,):
                 knots = _knots(form, np.concatenate([_KINDS[form](t.motion, k) for t in traces]))
                 if (k != j or not form.endswith("_k")) and len(knots) > 2:
-                    effects.append(Unknown(j, k, tuple(knots.tolist()), form))
-        for count in {len(e.knots) for e in effects}:
-            same = [e for e in effects if len(e.knots) == count]
-            columns = [columns_of(same, trace) for trace in traces]
-            for i, effect in enumerate(same):
-                out.append(Candidates((effect,), effect.joints[0], tuple(c[:, i : i + 1] for c in columns)))
-    return out
+                    alike[form, len(knots)].append(Unknown(j, k, tuple(knots.tolist()), form))
+
+    def evaluated(same: list[Unknown]) -> list[Candidates]:
+        columns = [columns_of(same, trace) for trace in traces]
+        return [
+            Candidates((effect,), effect.joints[0], tuple(c[:, i : i + 1] for c in columns))
+            for i, effect in enumerate(same)
+        ]
+
+    return [one for group in parallel(evaluated, alike.values()) for one in group]
 
 
 def _knots(form: str, x: np.ndarray) -> np.ndarray:

@@ -128,7 +128,7 @@ def _whitened(
         j = effect.joints[0]
         return {j: problem.whitened([c[:, 0] for c in _waves(problem, [effect])], noise, j)}
     if place is None:
-        wide = problem.full_columns([effect])
+        wide = problem.full_columns(effect)
     elif isinstance(effect, AbstractJointEffect):
         group, i = place
         j = effect.joints[0]
@@ -233,7 +233,7 @@ def least_shown(problem: Problem, state: State) -> tuple[Least, ...]:
         if ripples:
             columns = _waves(problem, ripples)
         else:
-            wide = [problem.full_columns([e]) for e in effects]
+            wide = [problem.full_columns(e) for e in effects]
             columns = [np.stack([w[r] for w in wide], 2) for r in range(len(problem.traces))]
         key = effects[0].name, effects[0].joints[0]
         rows[key] = [(0, one) for one in _least(problem, state, effects, columns)]

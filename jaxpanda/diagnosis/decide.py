@@ -5,23 +5,19 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.special
 from jaxtyping import Float
 
 from ..effects import CATALOGUE, AbstractEffect
 from ..effects.contact import ExternalContact
 from ..effects.friction import CoulombFriction
 from ..effects.load import PayloadChange
-from ..effects.memory import PreslidingHysteresis
 from .finding import Finding, joined
 from .problem import Problem, Term
-from .search import ACCEPT, State, instead, leftover, places, shares, without
+from .rivals import called, odds
+from .search import State, instead, leftover, places, shares, without
 from .uncertainty import covariances
 from .unnamed import hum, standing_off
 
-TEMPERATURE, RELATIVE_TEMPERATURE = 3.0, 0.0003
-"""By which differences of evidence are divided [nats, share of the evidence]: laws are never quite right, so that
-evidence overstates, the more the stronger the effect."""
 LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05
 """When a joint is not fully explained: this share of its squared residual beyond noise is left, more than this
 many times the noise's own, in a joint whose residual is at least this share of the largest."""
@@ -31,24 +27,8 @@ beyond two in its `crowd`: who needs many laws has not met the right one."""
 MEANT, AS_CLEAR = 0.05, 0.1
 """Share of a term's torque from which it counts among the laws of a joint; share of a term's evidence from which
 another's is about as clear."""
-HOLDS = {
-    "payload_change": ("payload",),
-    "inertial_parameters": ("payload",),
-    "torque_drift": ("torque_offset",),
-    "joint_spring": ("torque_offset",),
-    **dict.fromkeys(
-        ("asymmetric_friction", "stribeck_friction", "load_dependent_friction", "friction_drift"),
-        ("viscous_friction", "coulomb_friction"),
-    ),
-}
-"""Effects of which others are special cases; whoever sees as much of either takes the special one."""
-SPECIAL = 2.0
-"""By how much, as a logarithm: what richer laws pay for in evidence, the temperature takes from them."""
 MOST_ALIKE = 2
 """Terms of one effect at one place, beyond which it is not the right one: three ripples make any shape."""
-STICKS = 1.5e-3
-"""Breakaway distance below which friction with memory is Coulomb's that sticks [rad]: a joint at rest holds any
-load up to the level, which a sign of the velocity cannot say."""
 _WIDER = ("stribeck_friction", "asymmetric_friction", "load_dependent_friction", "friction_drift")
 _TOUCHING = 0.15
 """Pause between events that happened at once [s]."""
@@ -101,13 +81,6 @@ def partly(state: State) -> bool:
     return bool(np.any(main & (after > LEFT_CLEAR) & (after > LEFT * before)))
 
 
-def called(effect: AbstractEffect) -> str:
-    """The name of what an effect is: friction that builds up over a hair's breadth is Coulomb's, and sticks."""
-    if isinstance(effect, PreslidingHysteresis) and float(effect.breakaway_distance) < STICKS:
-        return CoulombFriction.name
-    return effect.name
-
-
 def titles(terms: Sequence[Term]) -> list[str]:
     """What each term is called beside the others: Coulomb's friction is part of the laws that hold it, and a body
     that is held while something pushes is part of the push."""
@@ -155,25 +128,11 @@ def _same(problem: Problem, a: Term, b: Term) -> bool:
 
 def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, float], float]:
     """Evidence of a term, probability of each effect in its place, its own included."""
-    term = state.terms[i]
+    effect = state.terms[i].effect
     evidence = state.design.log_evidence - without(state, i).log_evidence
-    by_name: dict[str, float] = {}
-    where: dict[str, tuple[int, ...]] = {}
-    for proposal in instead(problem, state, i):
-        name = called(proposal.effect)
-        if proposal.evidence > by_name.get(name, -np.inf):
-            by_name[name], where[name] = proposal.evidence, proposal.effect.joints
-    if term.effect.name == "unknown":  # it has met its margin already
-        by_name["unknown"] = max(by_name.get("unknown", -np.inf), evidence)
-    names = list(by_name)
-    weights = np.array([by_name[n] for n in names] + [0.5 * ACCEPT])
-    weights = weights / (TEMPERATURE + RELATIVE_TEMPERATURE * max(float(weights.max()), 0.0))
-    for k, name in enumerate(names):
-        if any(where.get(simple) == where.get(name) for simple in HOLDS.get(name, ())):
-            weights[k] -= SPECIAL
-    posterior = np.exp(weights - scipy.special.logsumexp(weights))
-    probability = dict(zip(names, posterior.tolist(), strict=False))
-    return evidence, probability, probability.get(called(term.effect), 0.0)
+    likely = odds(instead(problem, state, i), evidence if effect.name == "unknown" else None)
+    probability = {name: p for name, (p, _) in likely.items()}
+    return evidence, probability, probability.get(called(effect), 0.0)
 
 
 def coefficients(state: State, i: int) -> Float[np.ndarray, " n"]:

@@ -12,6 +12,7 @@ from ..effects.contact import ExternalContact
 from ..effects.drive import TorqueRipple
 from ..effects.load import EVER, PayloadChange
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes, log_mean_exp
+from .host import parallel
 from .problem import Problem
 
 BIN = 0.1
@@ -38,24 +39,25 @@ class Proposal:
         return self.effect.name, self.effect.joints
 
 
-def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]) -> Iterator[Proposal]:
-    """For each of these joints the likeliest order."""
-    for j in joints:
+def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]) -> list[Proposal]:
+    """For each of these joints that turns far enough the likeliest order."""
+
+    def one(j: int) -> Proposal | None:
         q = [t.motion.q[:, j] for t in problem.traces]
         travel = max(np.ptp(x) for x in q)
         speed = np.sqrt(np.mean(np.concatenate([t.motion.qd[:, j] for t in problem.traces]) ** 2))
         if travel < 0.1 or speed < 0.02:
-            continue
+            return None
         step = np.pi / (2 * travel)
         highest = min(400.0, 2 * np.pi * 0.9 * problem.traces[0].cutoff / speed)
         orders = np.arange(
             max(5.0, 3 * np.pi / travel), highest, step
         )  # one turn and a half, lest it be a spring
         if not len(orders):
-            continue
+            return None
         b, G = problem.projected(
             "ripple",
-            lambda q=q, orders=orders: [
+            lambda: [
                 np.stack([np.sin(x[:, None] * orders), np.cos(x[:, None] * orders)], 2) * on
                 for x, on in zip(q, problem.active, strict=True)
             ],
@@ -66,14 +68,15 @@ def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]
         deviation = np.full((len(orders), 2), noise.std[j] * np.sqrt(2))
         score, scale = log_bayes(b, G, deviation, SCALES)
         top = int(score.argmax())
-        evidence = float(log_mean_exp(score))
-        yield Proposal(
+        return Proposal(
             TorqueRipple(j, float(orders[top]), "one"),
-            evidence,
+            float(log_mean_exp(score)),
             float(score[top]),
             deviation[top] * scale[top],
             (0.4 * step / orders[top],),
         )
+
+    return [p for p in parallel(one, joints) if p is not None]
 
 
 def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal]:
@@ -98,10 +101,13 @@ def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal
         contact = [ExternalContact(i, 0.0, 1.0, trace.name, "base") for i in range(problem.dof)]
         change = PayloadChange(problem.dof - 1, 0.0, 1.0, trace.name, "gained")
         always = dataclasses.replace(change, start=-1e9, stop=1e9)
-        parts = [
-            _binned(problem, design, noise, r, slice(first[r], first[r + 1]), bins, j, always)
-            for j in range(problem.dof)
-        ]
+        rows = slice(first[r], first[r + 1])
+        parts = parallel(
+            lambda j, r=r, rows=rows, bins=bins, always=always: _binned(
+                problem, design, noise, r, rows, bins, j, always
+            ),
+            range(problem.dof),
+        )
         b, G, H, C = (_cumulated(np.sum([p[k] for p in parts], 0)) for k in range(4))
         if design.factor is not None:
             flat = np.swapaxes(C, 0, 1).reshape(C.shape[1], -1)

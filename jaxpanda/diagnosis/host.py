@@ -12,6 +12,8 @@ from threadpoolctl import threadpool_limits
 
 P = ParamSpec("P")
 R = TypeVar("R")
+_THREADS = 4
+"""At most: more wait for Python's lock, and slow down those that hold it."""
 
 
 def on_host(work: Callable[P, R]) -> Callable[P, R]:
@@ -33,7 +35,7 @@ def on_host(work: Callable[P, R]) -> Callable[P, R]:
 
 
 def parallel(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-    """`work` on each item, on as many threads as there are cores: large products let go of Python's lock."""
+    """`work` on each item, on some of the cores at once: large products let go of Python's lock."""
     items, cores = list(items), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     if cores == 1 or len(items) < 2:
         return [work(item) for item in items]
@@ -44,5 +46,5 @@ def parallel(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         with jax.default_device(device):
             return work(item)
 
-    with ThreadPoolExecutor(min(cores, len(items))) as pool:
+    with ThreadPoolExecutor(min(cores, len(items), _THREADS)) as pool:
         return list(pool.map(elsewhere, items))

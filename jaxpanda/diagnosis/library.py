@@ -13,6 +13,8 @@ from .traces import Trace
 
 _BATCHES = 4, 16
 """Shapes that one compiled call takes: what a refinement tries at once, and a grid."""
+_TOGETHER = 128
+"""Shapes of one form that one thread evaluates; of more, those of one joint."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +42,9 @@ def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndar
         for start in range(0, len(local), size):
             batch = list(local[start : start + size])
             filled = batch + [batch[-1]] * (size - len(batch))
-            parts.append(joint_columns(filled, trace.channels, trace.dt)[: len(batch)])
-        return trace.down(np.moveaxis(np.concatenate(parts), 0, 1))
+            fine = joint_columns(filled, trace.channels, trace.dt)
+            parts.append(trace.down(fine)[:, : len(batch)])
+        return np.concatenate(parts, 1)
     arm = [e for e in effects if isinstance(e, AbstractArmEffect)]
     return type(arm[0]).over_many(arm, trace.motion)
 
@@ -60,10 +63,21 @@ def build(traces: Sequence[Trace]) -> list[Candidates]:
             groups[form_of(effect)].append(effect)
     for trace in traces:  # made once, before there are threads
         trace.motion.load, trace.motion.regressor, trace.motion.mass, trace.motion.slope  # noqa: B018
+    parts = [part for effects in groups.values() for part in _split(effects)]
     evaluated = parallel(
-        lambda effects: _by_joint(effects, [columns_of(effects, trace) for trace in traces]), groups.values()
+        lambda effects: _by_joint(effects, [columns_of(effects, trace) for trace in traces]), parts
     )
-    return [candidates for group in evaluated for candidates in group]
+    return [candidates for part in evaluated for candidates in part]
+
+
+def _split(effects: Sequence[AbstractEffect]) -> list[list[AbstractEffect]]:
+    """Shapes of one form in parts that keep many cores busy: joint by joint, where they are many."""
+    if len(effects) <= _TOGETHER:
+        return [list(effects)]
+    by_joint: dict[tuple[int, ...], list[AbstractEffect]] = defaultdict(list)
+    for effect in effects:
+        by_joint[effect.joints].append(effect)
+    return list(by_joint.values())
 
 
 def _by_joint(effects: Sequence[AbstractEffect], columns: Sequence[np.ndarray]) -> list[Candidates]:

@@ -24,7 +24,8 @@ from ..effects.load import InertialParameters, Payload
 from . import knowledge as knowledge_
 from .noise import Saturation
 from .problem import Problem, Term, posed
-from .search import ACCEPT, State, gains, places, search
+from .rivals import ACCEPT
+from .search import State, gains, places, search
 from .traces import Trace
 
 CONTRADICTION, SHARE = 100.0, 0.03

@@ -100,18 +100,17 @@ class Problem:
 
     def term(self, effect: AbstractEffect, deviation: Float[np.ndarray, " n"]) -> Term:
         """The effect's columns in all recordings."""
-        return Term(effect, tuple(self.full_columns([effect])), deviation)
+        return Term(effect, tuple(self.full_columns(effect)), deviation)
 
-    def full_columns(self, effects: Sequence[AbstractEffect]) -> list[Float[np.ndarray, "_time dof _n"]]:
-        """Columns of one effect, at all joints."""
+    def full_columns(self, effect: AbstractEffect) -> list[Float[np.ndarray, "_time dof _n"]]:
+        """Columns of an effect, at all joints."""
+        columns = self.columns([effect])
+        if not isinstance(effect, AbstractJointEffect):
+            return [c[:, :, 0] for c in columns]
         out = []
-        for r, trace in enumerate(self.traces):
-            wide = np.zeros((trace.motion.samples, self.dof, len(effects[0].coefficients)))
-            here = self.placed(effects, r)
-            if here and isinstance(here[0], AbstractJointEffect):
-                wide[:, here[0].joints[0]] = columns_of(here, trace)[:, 0]
-            elif here:
-                wide = columns_of(here, trace)[:, :, 0]
+        for c in columns:
+            wide = np.zeros((len(c), self.dof, c.shape[2]))
+            wide[:, effect.joints[0]] = c[:, 0]
             out.append(wide)
         return out
 

@@ -17,12 +17,11 @@ from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
 from .events import BIN, Proposal, ripple, windows
 from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
 from .host import parallel
-from .library import Candidates
+from .library import Candidates, form_of
 from .problem import Problem, Term
+from .rivals import ACCEPT, called, odds
 from .scan import scales_of
 
-ACCEPT = 25.0
-"""Evidence that an effect needs, its search over shapes paid for [nats]."""
 SWAP = 3.0
 """Evidence that another effect must win by to take an accepted one's place [nats]."""
 SHADOW, EVENT_SHADOW = 0.03, 0.1
@@ -32,6 +31,8 @@ time, which fit any such leftover somewhere, need a larger share."""
 SECOND_JOINT = 0.03
 """Share of its torque, squared over noise, that a contact must show beside the joint that feels it most: a
 force on a link turns several joints, while what is left of a joint's own effect stays in that joint."""
+LASTING = 0.8
+"""Share of its recording that a contact takes at most."""
 HELD_OUT = 6.0
 """By which a term must lower the squared held-out error, in units of the noise's variance."""
 WORTH = 1.03
@@ -63,6 +64,8 @@ _TRIED = 8
 _SETTLED = 4
 _OVERLAP, _FELT = 0.05, 0.02
 _CLOSE = 0.5
+LIKELIER, _ELECTIONS = 3.0, 3
+"""How many times as likely a rival takes a term's place."""
 CROWDED, BEGUN = 6, 50.0
 """Terms from which another beginning is tried, and the evidence it must win by [nats]."""
 _SIMPLE = ("viscous_friction", "coulomb_friction", "presliding_hysteresis", "torque_offset")
@@ -102,6 +105,18 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
     """
     say = log.append if log is not None else (lambda _: None)
     state = finish(problem, grow(problem, start(problem), say), say)
+    for _ in range(_ELECTIONS if len(state.terms) <= MOST_SWAPPED else 0):
+        other = elected(problem, state, say)
+        if other is state:
+            break
+        other = finish(problem, grow(problem, other, say), say)
+        quiet = State(state.terms, other.noise, problem.design(state.terms, other.noise))
+        gained = other.design.log_evidence - quiet.design.log_evidence
+        more = len(other.terms) - len(state.terms)
+        say(f"which brings {gained:.0f}, with {more} terms more")
+        if more > 0 and gained < ACCEPT * more:
+            break
+        state = other
     if len(state.terms) < CROWDED:
         return state
     say("another beginning: friction and offset at all joints")
@@ -111,6 +126,24 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
     gained = other.design.log_evidence - quiet.design.log_evidence
     say(f"which brings {gained:.0f} over the other")
     return other if gained > BEGUN else state
+
+
+def elected(problem: Problem, state: State, say: Any) -> State:
+    """With the likeliest effects in the places of those that have a rival much likelier than they are.
+
+    What others brought while a term was chosen may be gone since, and a law that holds a simpler one has a little
+    more evidence where the simpler one is right.
+    """
+    terms = list(state.terms)
+    for i, term in enumerate(terms):
+        likely = odds(instead(problem, state, i))
+        own = likely.get(called(term.effect), (0.0, None))[0]
+        probability, best = max(likely.values(), key=lambda pair: pair[0])
+        if term.effect.name != "unknown" and best is not None and probability > LIKELIER * own:
+            say(f"{describe([best])} is likelier than {term.key}: {probability:.2g} to {own:.2g}")
+            terms[i] = problem.term(best.effect, best.deviation)
+            return with_terms(problem, terms)
+    return state
 
 
 def finish(problem: Problem, state: State, say: Any) -> State:
@@ -431,7 +464,8 @@ def _own(
         return None
     evidence = best - _PAID if found is None else found.evidence + best - found.best
     own = Proposal(effect, evidence, best, deviation, first_steps(effect))
-    return own if is_dissipative(problem, rest, noise, own) and has_play(problem, rest, noise, own) else None
+    stands = is_dissipative(problem, rest, noise, own) and has_play(problem, rest, noise, own)
+    return own if stands and is_event(problem, effect) else None
 
 
 def prune(problem: Problem, state: State, say: Any) -> State:
@@ -496,7 +530,16 @@ def ranked(
     refined = parallel(lambda p: refine(problem, design, noise, p), order[:close])
     refined = [p for p in refined if is_dissipative(problem, design, noise, p)]
     found = [p for p in (*refined, *order[close:]) if has_play(problem, design, noise, p)]
-    return sorted(found, key=lambda p: -p.evidence)
+    return sorted((p for p in found if is_event(problem, p.effect)), key=lambda p: -p.evidence)
+
+
+def is_event(problem: Problem, effect: AbstractEffect) -> bool:
+    """Whether what calls itself a contact leaves some of its recording alone: a force that is always there says
+    nothing of when, and takes what several joints' own effects explain together for one."""
+    if not isinstance(effect, ExternalContact):
+        return True
+    time = next(t.motion.time for t in problem.traces if t.name == effect.recording)
+    return float(effect.stop) - float(effect.start) < LASTING * float(time[-1] - time[0])
 
 
 def is_dissipative(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
@@ -508,13 +551,10 @@ def is_dissipative(problem: Problem, design: Design, noise: Noise, proposal: Pro
     effect = proposal.effect
     if not isinstance(effect, AsymmetricFriction):
         return True
-    j, term = effect.joints[0], problem.term(effect, proposal.deviation)
-    Phi = problem.whitened([c[:, j : j + 1] for c in term.columns], noise, j)
-    b, G = design.in_joint(j, Phi, gram(Phi))
-    c = np.linalg.solve(G[0] + np.diag(proposal.deviation**-2.0), b[0])
+    j, (c, _) = effect.joints[0], _fitted(problem, design, noise, proposal)
     power = [
-        (x[:, j] @ c + t.motion.friction[:, j]) * t.motion.qd[:, j]
-        for x, t in zip(term.columns, problem.traces, strict=True)
+        (x[:, 0] @ c + t.motion.friction[:, j]) * t.motion.qd[:, j]
+        for x, t in zip(problem.columns([effect]), problem.traces, strict=True)
     ]
     power = np.concatenate(power)
     return bool(-power[power < 0].sum() < _GIVEN * power[power > 0].sum())
@@ -527,10 +567,18 @@ def has_play(problem: Problem, design: Design, noise: Noise, proposal: Proposal)
     """
     if not isinstance(proposal.effect, Backlash) or proposal.evidence < ACCEPT:
         return True
-    term = problem.term(proposal.effect, proposal.deviation)
-    grown = problem.design((*design.terms, term), noise)
-    first = len(grown.x) - len(proposal.deviation)
-    return bool(grown.x[first] > CLEAR * np.sqrt(grown.covariance[first, first]))
+    c, covariance = _fitted(problem, design, noise, proposal)
+    return bool(c[0] > CLEAR * np.sqrt(covariance[0, 0]))
+
+
+def _fitted(
+    problem: Problem, design: Design, noise: Noise, proposal: Proposal
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+    """A proposal's coefficients beside what is in the model, and their covariance."""
+    effects = [proposal.effect]
+    b, G = _projected(problem, design, noise, effects, problem.columns(effects))
+    covariance = np.linalg.inv(G[0] + np.diag(proposal.deviation**-2.0))
+    return covariance @ b[0], covariance
 
 
 def is_elsewhere(effect: AbstractEffect, joints: Collection[int]) -> bool:
@@ -614,6 +662,18 @@ def _score(problem: Problem, design: Design, noise: Noise, effects, columns):
     """Evidence, likeliest scale, and prior deviations before the scale."""
     coefficients = effects[0].coefficients
     signs = np.array([float(k.sign) for k in coefficients])
+    b, G = _projected(problem, design, noise, effects, columns)
+    if isinstance(effects[0], AbstractJointEffect):
+        unit = float(noise.std[effects[0].joints[0]])
+        deviation = _deviation(coefficients, np.concatenate(columns), unit)
+    else:
+        deviation = _deviation(coefficients, np.concatenate(columns) / noise.std[:, None, None], 1.0)
+    value, scale = log_bayes(b, G, deviation, scales_of(effects[0]), signs)
+    return value, scale, deviation
+
+
+def _projected(problem: Problem, design: Design, noise: Noise, effects, columns):
+    """b and G of single shapes of one form at one place."""
 
     def prepared(j, parts):
         Phi = problem.whitened(parts, noise, j)
@@ -621,14 +681,9 @@ def _score(problem: Problem, design: Design, noise: Noise, effects, columns):
 
     if isinstance(effects[0], AbstractJointEffect):
         j = effects[0].joints[0]
-        b, G = design.in_joint(j, *prepared(j, columns))
-        deviation = _deviation(coefficients, np.concatenate(columns), float(noise.std[j]))
-    else:
-        parts = [prepared(j, [c[:, j] for c in columns]) for j in range(problem.dof)]
-        b, G = design.in_arm([p[0] for p in parts], [p[1] for p in parts])
-        deviation = _deviation(coefficients, np.concatenate(columns) / noise.std[:, None, None], 1.0)
-    value, scale = log_bayes(b, G, deviation, scales_of(effects[0]), signs)
-    return value, scale, deviation
+        return design.in_joint(j, *prepared(j, columns))
+    parts = [prepared(j, [c[:, j] for c in columns]) for j in range(problem.dof)]
+    return design.in_arm([p[0] for p in parts], [p[1] for p in parts])
 
 
 def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> Proposal:
@@ -655,10 +710,13 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
                 break
         else:
             steps = steps * 0.35
-    for variant in effect.variants(problem.traces[0].motion.arm):
-        value, its_deviation = _single(problem, design, noise, variant)
-        if value > best:
-            effect, best, deviation = variant, value, its_deviation
+    variants = sorted(effect.variants(problem.traces[0].motion.arm), key=form_of)
+    for _, alike in itertools.groupby(variants, form_of):
+        together = list(alike)
+        values, deviations = score(problem, design, noise, together)
+        top = int(values.argmax())
+        if values[top] > best:
+            effect, best, deviation = together[top], float(values[top]), deviations[top]
     gained = best - proposal.best
     return dataclasses.replace(
         proposal, effect=effect, best=best, deviation=deviation, evidence=proposal.evidence + gained

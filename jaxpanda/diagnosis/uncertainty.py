@@ -143,7 +143,7 @@ def _tangent(
     ends = [moved(effect, sign * step * unit) for sign in (-1.0, 1.0)]
     reached = [float(getattr(e, shape.name)) for e in ends]
     width = float(np.log(reached[1] / reached[0])) if shape.logarithmic else reached[1] - reached[0]
-    low, high = (problem.full_columns([e]) for e in ends)
+    low, high = (problem.full_columns(e) for e in ends)
     assert width > 0, (shape, value)
     slopes = tuple(((b - a) @ c / width)[:, :, None] for a, b in zip(low, high, strict=True))
     return slopes, wide / np.sqrt(12)

@@ -330,7 +330,7 @@ _LONGEST = 8192
 
 def joint_columns(
     effects: Sequence[AbstractJointEffect], channels: Channels, dt: float
-) -> Float[np.ndarray, "effects time n"]:
+) -> Float[np.ndarray, "time effects n"]:
     """Columns of many shapes of one form at once, a stretch after the other."""
     samples, out = channels.t.shape[0], []
     stretch = min(_WORK // len(effects), _LONGEST)
@@ -342,7 +342,7 @@ def joint_columns(
         part = jax.tree.map(lambda a, begin=begin: _filled(a[begin : begin + stretch], stretch), whole)
         z, columns = _advance(stacked, z, np.asarray(begin == 0), part, dt)
         out.append(columns)
-    return np.concatenate([np.asarray(columns) for columns in out], 1)[:, :samples]
+    return np.concatenate([np.asarray(columns) for columns in out])[:samples]
 
 
 @functools.cache
@@ -365,7 +365,7 @@ def _starts(effects, channels):
 @jax.jit
 def _advance(effects, z, first, channels, dt):
     z = jnp.where(first, _starts(effects, channels), z)
-    return jax.vmap(lambda effect, z: effect.advance(z, channels, dt))(effects, z)
+    return jax.vmap(lambda effect, z: effect.advance(z, channels, dt), out_axes=(0, 1))(effects, z)
 
 
 def smooth_sign(qd: Array, width: Array | float) -> Array:

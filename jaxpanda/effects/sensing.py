@@ -240,13 +240,13 @@ class EncoderOffset(AbstractArmEffect):
 
 
 class TimeDelay(AbstractArmEffect):
-    r"""Torque later than motion by d: $\tau_{measured}(t) = \tau(t - d)$.
+    r"""Torque out of step with motion: $\tau_{measured}(t) = \tau(t - d)$, in all joints or in one.
 
-    Torque sensors are filtered, position sensors hardly: d is not negative. Columns are
-    $(\tau(t - d_0) - \tau(t))/d_0$ of the nominal torque, so that the coefficient is d near $d_0$. In form
-    "smooth" the torque of the rigid arm is low-passed: the residual is made of the same noise of q,
-    differentiated twice, and what is shifted by half of its period would cancel it. Form "whole", without, is
-    tried where there is evidence of the smooth one.
+    Torque sensors are filtered, so that torque is mostly late; it is ahead (forms that end in "ahead") where the
+    positions come by a slower way. Columns are $(\tau(t - d_0) - \tau(t))/|d_0|$ of the nominal torque, so that
+    the coefficient is $|d|$ near $|d_0|$. In form "smooth" the torque of the rigid arm is low-passed: the
+    residual is made of the same noise of q, differentiated twice, and what is shifted by half of its period would
+    cancel it. Form "whole", without, is tried where there is evidence of the smooth one.
     """
 
     name: ClassVar[str] = "time_delay"
@@ -262,17 +262,23 @@ class TimeDelay(AbstractArmEffect):
     dof: int = eqx.field(static=True)
     around: float
     form: str = eqx.field(static=True, default="smooth")
+    joint: int | None = eqx.field(static=True, default=None)
+    """None for all."""
 
     def variants(self, arm: Arm) -> Sequence["TimeDelay"]:
-        return [dataclasses.replace(self, form="whole")]
+        return [dataclasses.replace(self, form=self.form.replace("smooth", "whole"))]
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["TimeDelay"]:
-        return [cls(arm.dof, d) for d in (0.002, 0.005, 0.01, 0.02, 0.04)]
+        of_all = [(d, None) for d in (0.002, 0.005, 0.01, 0.02, 0.04)]
+        of_one = [(d, j) for d in (0.004, 0.015) for j in range(arm.dof)]
+        return [
+            cls(arm.dof, d, form, j) for form in ("smooth", "smooth ahead") for d, j in (*of_all, *of_one)
+        ]
 
     @property
     def joints(self) -> tuple[int, ...]:
-        return tuple(range(self.dof))
+        return tuple(range(self.dof)) if self.joint is None else (self.joint,)
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -282,22 +288,36 @@ class TimeDelay(AbstractArmEffect):
     def equation(self) -> str:
         return "tau_measured(t) = tau(t - delay)"
 
+    @property
+    def _sign(self) -> float:
+        return -1.0 if self.form.endswith("ahead") else 1.0
+
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
-        d = float(self.around)
-        cutoff = _DELAY_CUTOFF if self.form == "smooth" else np.inf
-        torque, late = low_passed(motion.load, cutoff, motion.dt) + motion.friction, motion.time - d
-        shifted = np.stack([np.interp(late, motion.time, torque[:, j]) for j in range(motion.dof)], 1)
-        return ((shifted - torque) / d)[..., None]
+        d, joints = float(self.around), list(self.joints)
+        cutoff = _DELAY_CUTOFF if self.form.startswith("smooth") else np.inf
+        load = low_passed(motion.load[:, joints], cutoff, motion.dt)
+        torque, then = load + motion.friction[:, joints], motion.time - self._sign * d
+        out = np.zeros((motion.samples, motion.dof, 1))
+        for j, tau in zip(joints, torque.T, strict=True):
+            out[:, j, 0] = (np.interp(then, motion.time, tau) - tau) / d
+        return out
 
     def sensed(self, c, t, tau):
-        return _shifted(t, tau, -c[0])
+        return self._moved(t, tau, -self._sign * c[0])
 
     def true(self, c, t, tau):
-        return _shifted(t, tau, c[0])
+        return self._moved(t, tau, self._sign * c[0])
+
+    def _moved(self, t, tau, by):
+        if self.joint is None:
+            return _shifted(t, tau, by)
+        one = slice(self.joint, self.joint + 1)
+        return jnp.asarray(tau).at[:, one].set(_shifted(t, tau[:, one], by))
 
     def parameters(self, c, covariance):
         (delay,) = super().parameters(c, covariance)
-        return [{**delay, "joint": None}]
+        joint = None if self.joint is None else self.joint + 1
+        return [{**delay, "value": self._sign * delay["value"], "joint": joint}]
 
 
 def _shifted(t: Array, x: Float[Array, "time dof"], by: Array) -> Float[Array, "time dof"]:
