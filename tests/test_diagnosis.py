@@ -17,17 +17,19 @@ from jaxpanda import Arm, InputError, Recording
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
 from jaxpanda.diagnosis.decide import titles
+from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check, inertial_spread
 from jaxpanda.diagnosis.noise import autoregression
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
-from jaxpanda.diagnosis.rivals import called
-from jaxpanda.diagnosis.search import transferable, with_terms
+from jaxpanda.diagnosis.rivals import called, odds
+from jaxpanda.diagnosis.search import elected, is_event, transferable, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
-from jaxpanda.effects.friction import StribeckFriction
+from jaxpanda.effects.drive import Backlash, JointElasticity
+from jaxpanda.effects.friction import CoulombFriction, StribeckFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.report import to_html
@@ -203,6 +205,44 @@ def test_coulomb_s_friction_belongs_to_the_richer_law_at_its_joint():
         "stribeck_friction",
         "coulomb_friction",
     ]
+
+
+def test_a_soft_gear_belongs_to_the_gap_at_its_joint():
+    term = lambda effect: Term(effect, (), np.ones(1))
+    gap = Backlash(3, 0.01, 5000.0)
+    called = titles([term(gap), term(JointElasticity(3, 4000.0, 0.2)), term(JointElasticity(2, 4000.0, 0.2))])
+    assert called == ["backlash", "backlash", "joint_elasticity"]
+
+
+def test_a_law_that_holds_the_right_one_is_less_likely_than_it():
+    """Stribeck's is chosen by two nats of 33,000; a finding's own alternatives said five times as likely."""
+    stribeck = StribeckFriction(1, 0.01, 0.009, 2.0, "whole")
+    proposals = [
+        Proposal(effect, evidence, evidence, np.ones(1), ())
+        for effect, evidence in ((stribeck, 33326.0), (CoulombFriction(1, 0.009), 33324.0))
+    ]
+    likely = odds(proposals)
+    assert likely["coulomb_friction"][0] > 3 * likely["stribeck_friction"][0]
+    assert sum(p for p, _ in likely.values()) == pytest.approx(1)
+
+
+def test_a_force_that_is_always_there_is_no_contact():
+    trace = prepare(record(0), Arm.panda())
+    problem = pose((trace,), (True,), "exact").problem
+    start, stop = (float(t) for t in trace.motion.time[[0, -1]])
+    assert not is_event(problem, ExternalContact(4, start, stop, trace.name, "base"))
+    assert is_event(problem, ExternalContact(4, start, 0.5 * (start + stop), trace.name, "base"))
+
+
+@pytest.mark.slow
+def test_a_much_likelier_rival_takes_a_term_s_place():
+    """A term that has no evidence beside what is there any more, put in by hand."""
+    friction = lambda t, q, qd, qdd: np.tanh(qd / 0.01) * (np.arange(7) == 3) * 0.6
+    problem = pose((prepare(record(3, friction), Arm.panda()),), (True,), "exact").problem
+    wrong = problem.term(TorqueOffset(3), np.array([0.1]))
+    found = elected(problem, with_terms(problem, [wrong]), lambda _: None)
+    assert [t.key for t in found.terms] == [("coulomb_friction", (3,))]
+    assert elected(problem, found, lambda _: None) is found
 
 
 @pytest.mark.slow

@@ -8,7 +8,9 @@ from jaxpanda_kernels import rnea
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose
-from jaxpanda.diagnosis.unnamed import hum
+from jaxpanda.diagnosis.premises import pose
+from jaxpanda.diagnosis.traces import prepare as prepare_trace
+from jaxpanda.diagnosis.unnamed import hum, stuck
 from jaxpanda.signals import prepare
 
 ARM = Arm.panda()
@@ -93,3 +95,32 @@ def test_a_diagnosis_says_that_it_hums_beside_what_it_finds(tmp_path):
     ]
     assert found.verdict == "partly_explained"
     assert "50.0" in found.findings[1].summary
+
+
+def test_a_torque_that_repeats_itself_while_the_arm_moves_is_told_with_its_times():
+    one = recording()
+    frozen = [(3.0, 3.6), (9.0, 9.5)]
+    for start, stop in frozen:
+        inside = (one.time >= start) & (one.time <= stop)
+        one.tau[inside, 3] = one.tau[np.argmax(inside), 3]
+    trace = prepare_trace(one, ARM)
+    found = stuck(pose((trace,), (True,), "exact").problem)
+    assert found is not None
+    assert (found.effect, found.joints) == ("unknown", (3,))
+    np.testing.assert_allclose(found.intervals, frozen, atol=2 / RATE)
+    assert found.rms_torque[3] > 3 * NOISE
+    for start, stop in frozen:
+        inside = (trace.motion.time > start) & (trace.motion.time < stop)
+        assert not trace.trust[inside, 3].any()
+        assert trace.trust[inside, 4].any()
+
+
+def test_coarse_torque_of_an_arm_at_rest_is_not_stuck():
+    t = np.arange(0, SECONDS, 1 / RATE)
+    pace = 1 - np.exp(-(((t - 8.0) / 2.0) ** 8))  # stands for some seconds
+    clock = np.cumsum(pace) / RATE
+    q = excitation(ARM, clock, 3)[0]
+    qd = np.gradient(q, t, axis=0)
+    tau = 0.5 * np.round(np.asarray(LOAD(q, qd, np.gradient(qd, t, axis=0))) / 0.5)
+    assert np.ptp(tau[(t > 7.0) & (t < 9.0)], axis=0).max() == 0.0
+    assert prepare_trace(Recording("rest.csv", t, q, tau=tau), ARM).stuck == ()

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from ..effects import CATALOGUE, AbstractEffect
 from ..effects.contact import ExternalContact
+from ..effects.drive import Backlash, JointElasticity
 from ..effects.friction import CoulombFriction
 from ..effects.load import PayloadChange
 from .finding import Finding, joined
@@ -16,7 +17,7 @@ from .problem import Problem, Term
 from .rivals import called, odds
 from .search import State, instead, leftover, places, shares, without
 from .uncertainty import covariances
-from .unnamed import hum, standing_off
+from .unnamed import hum, standing_off, stuck
 
 LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05
 """When a joint is not fully explained: this share of its squared residual beyond noise is left, more than this
@@ -49,9 +50,10 @@ def findings(problem: Problem, state: State) -> list[Finding]:
     out = [_finding(problem, state, group, names[group[0]], rivals, doubt, spread) for group in groups]
     # what is in the band of the search belongs to what was found there
     lowest = {"lowest": problem.traces[0].cutoff} if out else {}
+    halted = stuck(problem)
     unnamed = hum([t.signals for t in problem.traces], problem.active, state.noise.std, **lowest)
     unnamed = unnamed or (None if out else standing_off(problem, state))
-    return sorted(out, key=lambda f: -f.evidence) + ([unnamed] if unnamed else [])
+    return sorted(out, key=lambda f: -f.evidence) + [f for f in (halted, unnamed) if f is not None]
 
 
 def crowd(
@@ -82,16 +84,18 @@ def partly(state: State) -> bool:
 
 
 def titles(terms: Sequence[Term]) -> list[str]:
-    """What each term is called beside the others: Coulomb's friction is part of the laws that hold it, and a body
-    that is held while something pushes is part of the push."""
+    """What each term is called beside the others: Coulomb's friction is part of the laws that hold it, softness
+    of a gear that has a gap, and a body that is held while something pushes is part of the push."""
     out = []
     for term in terms:
         name = called(term.effect)
         if any(_meets(term.effect, other.effect) for other in terms):
             name = ExternalContact.name
+        beside = [t.effect.name for t in terms if t.effect.joints == term.effect.joints]
         if name == CoulombFriction.name:
-            beside = [t.effect.name for t in terms if t.effect.joints == term.effect.joints]
             name = next((n for n in _WIDER if n in beside), name)
+        if name == JointElasticity.name and Backlash.name in beside:
+            name = Backlash.name
         out.append(name)
     return out
 

@@ -35,6 +35,8 @@ from .uncertainty import polished
 CORRECTED = "corrected.json"
 """What `predict` reads."""
 NEXT_MOTION = "next_motion.csv"
+DOUBTFUL = 0.2
+"""Confidence of a finding below which what it stands for counts as not explained."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,7 +217,7 @@ def diagnose(
     text, warnings = _corrected_xml(source, corrected)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
-        verdict=_verdict([f.effect for f in found], partly(state)),
+        verdict=_verdict(found, partly(state)),
         findings=found,
         fit=fit(problem, kept),
         corrected=corrected,
@@ -310,11 +312,13 @@ def _rms(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.sqrt(np.mean(stacked**2, 0)) if len(stacked) else np.zeros(stacked.shape[1])
 
 
-def _verdict(names: Sequence[str], partly: bool) -> str:
+def _verdict(found: Sequence[Finding], partly: bool) -> str:
+    names = [f.effect for f in found]
     if not names:
         return "consistent"
     if "unknown" not in names:
-        return "partly_explained" if partly else "explained"
+        doubtful = any(f.confidence < DOUBTFUL for f in found)
+        return "partly_explained" if partly or doubtful else "explained"
     return "unexplained" if set(names) == {"unknown"} else "partly_explained"
 
 

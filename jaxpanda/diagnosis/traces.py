@@ -43,6 +43,8 @@ _SHARPER, _SHARP = 2.5, 6.0
 """Where motion is looked for that a filter took away, in its cutoffs; and how far above noise it must be."""
 _RINGING = 0.2
 """Share of it with which the filter of q still rings a period of its cutoff away."""
+_FROZEN, _MOVES = 0.1, 5.0
+"""Torque that repeats itself for so long [s], while it must change by so many noises, is stuck."""
 _STILL = 3e-3
 """Travel below which a joint stands still in a recording [rad]."""
 _BESIDE = 0.02
@@ -85,7 +87,9 @@ class Trace:
     trust: Float[np.ndarray, "time dof"]
     """What a sample weighs in each joint, 0 to 1: less where nothing tells which way known friction points, and
     where the motion is sharper than the filter of q lets through; none where the joint never moves, as friction
-    at rest may carry any part of its load."""
+    at rest may carry any part of its load, and none where its torque is stuck."""
+    stuck: tuple[tuple[int, float, float], ...] = ()
+    """Joint, start and stop [s] of stretches in which measured torque repeats itself although it must change."""
 
     @property
     def weights(self) -> Float[np.ndarray, "time dof"]:
@@ -190,7 +194,32 @@ def prepare(
         trust = 1 / np.sqrt(1 + (unsure / np.maximum(noise, 1e-12)) ** 2)
         if not whole:
             trust[:, np.ptp(motion.q, axis=0) < _STILL] = 0.0
-    return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust)
+    stuck = () if whole or noise is None else _stuck(recording, motion, noise)
+    for joint, start, stop in stuck:
+        trust[(motion.time > start - _NEAR) & (motion.time < stop + _NEAR), joint] = 0.0
+    return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust, stuck)
+
+
+def _stuck(
+    recording: Recording, motion: Motion, noise: Float[np.ndarray, " dof"]
+) -> tuple[tuple[int, float, float], ...]:
+    """Where a joint's torque is the same from row to row for long, while the nominal torque changes by far more
+    than its noise and the steps it is written in."""
+    out = []
+    if recording.tau is None:
+        return ()
+    for joint, tau in enumerate(recording.tau.T):
+        steps = np.abs(np.diff(tau))
+        written = float(np.min(steps[steps > 0], initial=np.inf))
+        edges = np.flatnonzero(np.diff(np.r_[False, steps == 0, False]))
+        for first, last in edges.reshape(-1, 2):
+            start, stop = float(recording.time[first]), float(recording.time[last])
+            inside = (motion.time >= start) & (motion.time <= stop)
+            if stop - start < _FROZEN or not inside.any():
+                continue
+            if np.ptp(motion.torque[inside, joint]) > _MOVES * max(noise[joint], written):
+                out.append((joint, start, stop))
+    return tuple(out)
 
 
 def _weight(

@@ -1,5 +1,6 @@
 r"""What no effect of the catalogue explains, and no free curve either.
 
+- A torque that is stuck: the sensor repeats its last value, or is at its limit, while the arm moves.
 - A joint that stands off its noise, always or now and then.
 - A torque that hums: a line in its spectrum, as the mains, a fan or a shaking floor leave, at one frequency
   whatever the arm does. It is looked for in the torque as measured, also above the band in which effects are
@@ -72,6 +73,40 @@ def standing_off(problem: Problem, state: State) -> Finding | None:
         summary=f"Joint {joint + 1} is {np.sqrt(beyond[joint]):.1f} times its noise off the simulation"
         + ("" if whole else f" at times, in {trace.name} first from {when[0][0]:.2f} s to {when[0][1]:.2f} s")
         + "; neither a named effect nor a free curve explains it.",
+        terms=(),
+    )
+
+
+def stuck(problem: Problem) -> Finding | None:
+    """Torque that repeats itself while the arm moves, in the recording that has most of it; None if none does."""
+    suspect = [trace for trace, on in zip(problem.traces, problem.active, strict=True) if on]
+    trace = max(suspect, key=lambda t: sum(stop - start for _, start, stop in t.stuck))
+    if not trace.stuck:
+        return None
+    joints = tuple(sorted({joint for joint, _, _ in trace.stuck}))
+    when = joined(sorted((start, stop) for _, start, stop in trace.stuck), 0.0)
+    error = np.zeros(trace.residual.shape)
+    for joint, start, stop in trace.stuck:
+        inside = (trace.motion.time >= start) & (trace.motion.time <= stop)
+        error[inside, joint] = trace.residual[inside, joint]
+    assert trace.signals.tau is not None
+    white = white_noise(trace.signals.tau)
+    rms = np.sqrt((error**2).sum(0) / np.maximum((error != 0).sum(0), 1))
+    return Finding(
+        effect="unknown",
+        joints=joints,
+        recordings=(trace.name,),
+        intervals=when,
+        confidence=0.995,
+        alternatives=(),
+        equation="tau = constant",
+        parameters=(),
+        rms_torque=rms,
+        evidence=float(0.5 * np.sum((error / white) ** 2)),
+        summary=f"The measured torque of joint{'s' * (len(joints) > 1)} "
+        f"{', '.join(str(j + 1) for j in joints)} is stuck in {trace.name}, first from {when[0][0]:.2f} s to"
+        f" {when[0][1]:.2f} s, while the arm moves: a sensor that repeats itself or is at its limit. What it gave"
+        " then was not used.",
         terms=(),
     )
 
