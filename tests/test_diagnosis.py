@@ -24,12 +24,12 @@ from jaxpanda.diagnosis.noise import autoregression
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
 from jaxpanda.diagnosis.rivals import called, odds
-from jaxpanda.diagnosis.search import elected, is_event, transferable, with_terms
+from jaxpanda.diagnosis.search import elected, is_event, is_undetermined, transferable, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.drive import Backlash, JointElasticity
-from jaxpanda.effects.friction import CoulombFriction, StribeckFriction
+from jaxpanda.effects.friction import CoulombFriction, FrictionDrift, StribeckFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.report import to_html
@@ -298,6 +298,22 @@ def test_what_fits_one_recording_only_is_left_out_of_the_corrected_model():
 
 
 @pytest.mark.slow
+def test_friction_whose_parts_cancel_is_left_out_of_the_corrected_model():
+    """Fitted to speeds that do not tell its parts apart, it predicted hundreds of N·m at others."""
+    own = lambda t, q, qd, qdd: np.stack([np.tanh(qd[:, 3] / 0.1), np.tanh(qd[:, 3] / 0.11)], 1)
+    extra = lambda *s: (own(*s) @ [40.0, -40.0])[:, None] * (np.arange(7) == 3)
+    trace = prepare(record(4, extra), Arm.panda())
+    problem = pose((trace,), (True,), "exact").problem
+    m = trace.motion
+    columns = own(m.time, m.q, m.qd, m.qdd)[:, None] * (np.arange(7) == 3)[:, None]
+    law = Term(FrictionDrift(3, 5.0, 0.1, "both extra"), (columns,), np.full(2, 50.0))
+    state = with_terms(problem, [law])
+    assert abs(state.design.x[-1]) > 10
+    assert transferable(problem, state).terms == ()
+    good = problem.term(CoulombFriction(3, 0.1), np.array([0.3]))
+    assert not is_undetermined(with_terms(problem, [good]), 0)
+
+
 def test_what_does_not_know_the_direction_is_no_friction():
     """A torque that rises with the speed, whatever its sign, used to be called friction that is asymmetric."""
 

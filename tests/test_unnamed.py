@@ -102,16 +102,16 @@ def test_a_torque_that_repeats_itself_while_the_arm_moves_is_told_with_its_times
     frozen = [(3.0, 3.6), (9.0, 9.5)]
     for start, stop in frozen:
         inside = (one.time >= start) & (one.time <= stop)
-        one.tau[inside, 3] = one.tau[np.argmax(inside), 3]
+        one.tau[inside, 1] = one.tau[np.argmax(inside), 1]
     trace = prepare_trace(one, ARM)
     found = stuck(pose((trace,), (True,), "exact").problem)
     assert found is not None
-    assert (found.effect, found.joints) == ("unknown", (3,))
+    assert (found.effect, found.joints) == ("unknown", (1,))
     np.testing.assert_allclose(found.intervals, frozen, atol=2 / RATE)
-    assert found.rms_torque[3] > 3 * NOISE
+    assert found.rms_torque[1] > 3 * NOISE
     for start, stop in frozen:
         inside = (trace.motion.time > start) & (trace.motion.time < stop)
-        assert not trace.trust[inside, 3].any()
+        assert not trace.trust[inside, 1].any()
         assert trace.trust[inside, 4].any()
 
 

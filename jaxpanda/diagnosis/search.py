@@ -12,6 +12,7 @@ from jaxtyping import Float
 from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import Backlash, JointElasticity
+from ..effects.effect import AbstractDryFriction
 from ..effects.friction import AsymmetricFriction
 from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
 from .events import BIN, Proposal, ripple, windows
@@ -37,6 +38,8 @@ HELD_OUT = 6.0
 """By which a term must lower the squared held-out error, in units of the noise's variance."""
 WORTH = 1.03
 """By which the squared error of predicted torque must be smaller than with the user's model."""
+OPPOSED = 20.0
+"""How many times the torque of a law its parts may be."""
 UNKNOWN_MARGIN, UNKNOWN_SHARE = 10.0, 0.06
 """What a free form must win by [nats, share]."""
 USUAL = {
@@ -337,8 +340,10 @@ def transferable(problem: Problem, state: State) -> State:
     """Without the terms that make torque worse where their coefficients were not fitted; without all that can be
     tested so, where together they gain next to nothing.
 
-    What stands in for physics that has no name fits where it was fitted, and misleads elsewhere.
+    What stands in for physics that has no name fits where it was fitted, and misleads elsewhere. So does a law of
+    friction whose parts these speeds do not tell apart.
     """
+    state = with_terms(problem, [t for i, t in enumerate(state.terms) if not is_undetermined(state, i)])
     while lasting := [i for i, t in enumerate(state.terms) if not t.effect.bound_to_recording]:
         whole, users = problem.predicted_error(state.design, state.noise)
         harm = {i: whole - problem.predicted_error(without(state, i), state.noise)[0] for i in lasting}
@@ -350,6 +355,16 @@ def transferable(problem: Problem, state: State) -> State:
         else:
             break
     return state
+
+
+def is_undetermined(state: State, i: int) -> bool:
+    """Whether a term is friction whose parts are many times their sum: at other speeds they are not."""
+    term = state.terms[i]
+    if not isinstance(term.effect, AbstractDryFriction):
+        return False
+    parts = np.concatenate(term.columns) * state.design.x[places(state)[i]]
+    rms = lambda torque: float(np.sqrt(np.mean(torque**2)))
+    return max(rms(part) for part in np.moveaxis(parts, -1, 0)) > OPPOSED * rms(parts.sum(-1))
 
 
 def contest(problem: Problem, state: State, say: Any) -> State:
