@@ -24,7 +24,7 @@ from jaxpanda.diagnosis.noise import autoregression
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
 from jaxpanda.diagnosis.rivals import called, odds
-from jaxpanda.diagnosis.search import elected, is_event, is_undetermined, transferable, with_terms
+from jaxpanda.diagnosis.search import elected, floors, is_event, is_undetermined, transferable, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
@@ -232,6 +232,20 @@ def test_a_force_that_is_always_there_is_no_contact():
     start, stop = (float(t) for t in trace.motion.time[[0, -1]])
     assert not is_event(problem, ExternalContact(4, start, stop, trace.name, "base"))
     assert is_event(problem, ExternalContact(4, start, 0.5 * (start + stop), trace.name, "base"))
+
+
+def test_a_brief_contact_must_show_more_than_a_lasting_law_does_meanwhile(monkeypatch):
+    """What Stribeck's friction left of a reversal passed for a push of 0.2 s."""
+    push = lambda t, *s: 0.5 * ((t > 4.0) & (t < 4.2))[:, None] * (np.arange(7) < 4)
+    rubs = lambda t, q, qd, qdd: np.tanh(qd / 0.01) * (np.arange(7) == 3)
+    trace = prepare(record(5, lambda *s: push(*s) + rubs(*s)), Arm.panda())
+    problem = pose((trace,), (True,), "exact").problem
+    contact = problem.term(ExternalContact(3, 4.0, 4.2, trace.name, "base"), np.full(6, 5.0))
+    friction = problem.term(CoulombFriction(3, 0.01), np.array([0.5]))
+    state = with_terms(problem, [friction, contact])
+    brief = floors(state, [1e6, 1e3])[1]
+    monkeypatch.setattr("jaxpanda.diagnosis.search.BRIEF", 0.1)
+    assert brief == pytest.approx(10 * floors(state, [1e6, 1e3])[1])
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
-from .search import State, elected, transferable
+from .search import ELECTIONS, State, elected, transferable
 from .traces import Trace, prepare
 from .uncertainty import polished
 
@@ -202,8 +202,11 @@ def diagnose(
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
     problem = premises.problem
     state = polished(problem, state)
-    other = elected(problem, state, log.append)
-    state = state if other is state else polished(problem, other)
+    for _ in range(ELECTIONS):
+        other = elected(problem, state, log.append)
+        if other is state:
+            break
+        state = polished(problem, other)
     found = tuple(findings(problem, state))
     kept = transferable(problem, state)
     corrected = _corrected(arm, premises, kept)

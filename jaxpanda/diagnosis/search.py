@@ -29,6 +29,8 @@ SHADOW, EVENT_SHADOW = 0.03, 0.1
 """Share of a stronger term's evidence, in the joints and at the times where a weaker one acts, below which
 the weaker is taken for its shadow: for what the stronger's shape, never quite right, leaves over. Events in
 time, which fit any such leftover somewhere, need a larger share."""
+BRIEF = 0.3
+"""Duration below which a contact may be what a law leaves of a reversal or an impact [s]."""
 SECOND_JOINT = 0.03
 """Share of its torque, squared over noise, that a contact must show beside the joint that feels it most: a
 force on a link turns several joints, while what is left of a joint's own effect stays in that joint."""
@@ -67,8 +69,8 @@ _TRIED = 8
 _SETTLED = 4
 _OVERLAP, _FELT = 0.05, 0.02
 _CLOSE = 0.5
-LIKELIER, _ELECTIONS = 3.0, 3
-"""How many times as likely a rival takes a term's place."""
+LIKELIER, ELECTIONS = 3.0, 3
+"""How many times as likely a rival takes a term's place, and how often one does in a row."""
 CROWDED, BEGUN = 6, 50.0
 """Terms from which another beginning is tried, and the evidence it must win by [nats]."""
 _SIMPLE = ("viscous_friction", "coulomb_friction", "presliding_hysteresis", "torque_offset")
@@ -108,7 +110,7 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
     """
     say = log.append if log is not None else (lambda _: None)
     state = finish(problem, grow(problem, start(problem), say), say)
-    for _ in range(_ELECTIONS if len(state.terms) <= MOST_SWAPPED else 0):
+    for _ in range(ELECTIONS if len(state.terms) <= MOST_SWAPPED else 0):
         other = elected(problem, state, say)
         if other is state:
             break
@@ -293,7 +295,8 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
     stronger term, the share $s_{ij}$ of the term's torque (squared, over noise) that acts in joint j, and the
     share $s_{kj}$ of the stronger one's that acts in joint j while the term does. What is strong in one joint
     casts no shadow on another. A soft joint's swings and a gap's impacts come at moments that the fitted law has
-    elsewhere: their shadow falls on all times.
+    elsewhere: their shadow falls on all times. A contact as brief as the reversal of a joint could be all that a
+    stronger law has wrong there.
     """
     energy = energies(state)
     total = np.maximum(energy.sum((1, 2)), 1e-300)
@@ -302,13 +305,20 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
         where = energy[i].sum(1) / total[i]
         once = term.effect.bound_to_recording
         rows = energy[i].any(0) if once else np.ones(energy.shape[2], bool)
+        share = EVENT_SHADOW if once else SHADOW
+        brief = isinstance(term.effect, ExternalContact) and term.effect.stop - term.effect.start < BRIEF
         beside = 0.0
         for k in range(len(total)):
             if gained[k] > gained[i]:
-                swings = isinstance(state.terms[k].effect, Backlash | JointElasticity)
-                felt = energy[k].sum(1) if swings else energy[k][:, rows].sum(1)
-                beside += gained[k] * float(where @ felt) / total[k]
-        least = max(ACCEPT, (EVENT_SHADOW if once else SHADOW) * beside)
+                other = state.terms[k].effect
+                felt = (
+                    energy[k].sum(1)
+                    if isinstance(other, Backlash | JointElasticity)
+                    else energy[k][:, rows].sum(1)
+                )
+                whole = brief and not other.bound_to_recording
+                beside += (1.0 if whole else share) * gained[k] * float(where @ felt) / total[k]
+        least = max(ACCEPT, beside)
         if isinstance(term.effect, ExternalContact):
             beyond = total[i] * (1 - where.max())
             if beyond < max(SECOND_JOINT * total[i], 0.5 * ACCEPT):
