@@ -311,7 +311,6 @@ def test_what_fits_one_recording_only_is_left_out_of_the_corrected_model():
     assert len(transferable(same, with_terms(same, terms)).terms) == 1
 
 
-@pytest.mark.slow
 def test_friction_whose_parts_cancel_is_left_out_of_the_corrected_model():
     """Fitted to speeds that do not tell its parts apart, it predicted hundreds of N·m at others."""
     own = lambda t, q, qd, qdd: np.stack([np.tanh(qd[:, 3] / 0.1), np.tanh(qd[:, 3] / 0.11)], 1)
@@ -328,6 +327,7 @@ def test_friction_whose_parts_cancel_is_left_out_of_the_corrected_model():
     assert not is_undetermined(with_terms(problem, [good]), 0)
 
 
+@pytest.mark.slow
 def test_what_does_not_know_the_direction_is_no_friction():
     """A torque that rises with the speed, whatever its sign, used to be called friction that is asymmetric."""
 

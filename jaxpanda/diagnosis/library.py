@@ -13,8 +13,6 @@ from .traces import Trace
 
 _BATCHES = 4, 16
 """Shapes that one compiled call takes: what a refinement tries at once, and a grid."""
-_TOGETHER = 128
-"""Shapes of one form that one thread evaluates; of more, those of one joint."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,21 +61,10 @@ def build(traces: Sequence[Trace]) -> list[Candidates]:
             groups[form_of(effect)].append(effect)
     for trace in traces:  # made once, before there are threads
         trace.motion.load, trace.motion.regressor, trace.motion.mass, trace.motion.slope  # noqa: B018
-    parts = [part for effects in groups.values() for part in _split(effects)]
     evaluated = parallel(
-        lambda effects: _by_joint(effects, [columns_of(effects, trace) for trace in traces]), parts
+        lambda effects: _by_joint(effects, [columns_of(effects, trace) for trace in traces]), groups.values()
     )
-    return [candidates for part in evaluated for candidates in part]
-
-
-def _split(effects: Sequence[AbstractEffect]) -> list[list[AbstractEffect]]:
-    """Shapes of one form in parts that keep many cores busy: joint by joint, where they are many."""
-    if len(effects) <= _TOGETHER:
-        return [list(effects)]
-    by_joint: dict[tuple[int, ...], list[AbstractEffect]] = defaultdict(list)
-    for effect in effects:
-        by_joint[effect.joints].append(effect)
-    return list(by_joint.values())
+    return [candidates for group in evaluated for candidates in group]
 
 
 def _by_joint(effects: Sequence[AbstractEffect], columns: Sequence[np.ndarray]) -> list[Candidates]:

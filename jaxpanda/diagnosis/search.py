@@ -115,9 +115,7 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
         if other is state:
             break
         other = finish(problem, grow(problem, other, say), say)
-        quiet = State(state.terms, other.noise, problem.design(state.terms, other.noise))
-        gained = other.design.log_evidence - quiet.design.log_evidence
-        more = len(other.terms) - len(state.terms)
+        gained, more = gained_over(problem, other, state), len(other.terms) - len(state.terms)
         say(f"which brings {gained:.0f}, with {more} terms more")
         if more > 0 and gained < ACCEPT * more:
             break
@@ -127,10 +125,14 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
     say("another beginning: friction and offset at all joints")
     other = with_terms(problem, everywhere(problem, state.noise))
     other = finish(problem, grow(problem, other, say, lasting=True), say)
-    quiet = State(state.terms, other.noise, problem.design(state.terms, other.noise))
-    gained = other.design.log_evidence - quiet.design.log_evidence
+    gained = gained_over(problem, other, state)
     say(f"which brings {gained:.0f} over the other")
     return other if gained > BEGUN else state
+
+
+def gained_over(problem: Problem, state: State, other: State) -> float:
+    """Evidence of a state over that of another, both in the first one's noise [nats]."""
+    return state.design.log_evidence - problem.design(other.terms, state.noise).log_evidence
 
 
 def elected(problem: Problem, state: State, say: Any) -> State:
@@ -141,10 +143,12 @@ def elected(problem: Problem, state: State, say: Any) -> State:
     """
     terms = list(state.terms)
     for i, term in enumerate(terms):
+        if term.effect.name == "unknown":
+            continue
         likely = odds(instead(problem, state, i))
         own = likely.get(called(term.effect), (0.0, None))[0]
         probability, best = max(likely.values(), key=lambda pair: pair[0])
-        if term.effect.name != "unknown" and best is not None and probability > LIKELIER * own:
+        if best is not None and probability > LIKELIER * own:
             say(f"{describe([best])} is likelier than {term.key}: {probability:.2g} to {own:.2g}")
             terms[i] = problem.term(best.effect, best.deviation)
             return with_terms(problem, terms)
@@ -311,11 +315,8 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
         for k in range(len(total)):
             if gained[k] > gained[i]:
                 other = state.terms[k].effect
-                felt = (
-                    energy[k].sum(1)
-                    if isinstance(other, Backlash | JointElasticity)
-                    else energy[k][:, rows].sum(1)
-                )
+                swings = isinstance(other, Backlash | JointElasticity)
+                felt = energy[k].sum(1) if swings else energy[k][:, rows].sum(1)
                 whole = brief and not other.bound_to_recording
                 beside += (1.0 if whole else share) * gained[k] * float(where @ felt) / total[k]
         least = max(ACCEPT, beside)
@@ -563,8 +564,13 @@ def is_event(problem: Problem, effect: AbstractEffect) -> bool:
     nothing of when, and takes what several joints' own effects explain together for one."""
     if not isinstance(effect, ExternalContact):
         return True
-    time = next(t.motion.time for t in problem.traces if t.name == effect.recording)
+    time = clock(problem, effect.recording)
     return float(effect.stop) - float(effect.start) < LASTING * float(time[-1] - time[0])
+
+
+def clock(problem: Problem, recording: str) -> Float[np.ndarray, " time"]:
+    """Times of a recording, by its name [s]."""
+    return next(t.motion.time for t in problem.traces if t.name == recording)
 
 
 def is_dissipative(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
@@ -763,7 +769,7 @@ def within(problem: Problem, effect: AbstractEffect) -> AbstractEffect:
         return dataclasses.replace(effect, start=middle - 0.5 * BIN, stop=middle + 0.5 * BIN)
     if not isinstance(effect, PayloadChange):
         return effect
-    time = next(t.motion.time for t in problem.traces if t.name == effect.recording)
+    time = clock(problem, effect.recording)
     inside = lambda at: at if abs(at) >= EVER else float(np.clip(at, time[0] + 3 * BIN, time[-1] - 3 * BIN))
     return dataclasses.replace(effect, start=inside(float(effect.start)), stop=inside(float(effect.stop)))
 

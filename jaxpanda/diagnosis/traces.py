@@ -194,30 +194,33 @@ def prepare(
         trust = 1 / np.sqrt(1 + (unsure / np.maximum(noise, 1e-12)) ** 2)
         if not whole:
             trust[:, np.ptp(motion.q, axis=0) < _STILL] = 0.0
-    stuck = () if whole or noise is None else _stuck(recording, motion, noise)
+    stuck = ()
+    if recording.tau is not None and noise is not None and not whole:
+        stuck = _stuck(recording.time, recording.tau, motion, noise)
     for joint, start, stop in stuck:
         trust[(motion.time > start - _NEAR) & (motion.time < stop + _NEAR), joint] = 0.0
     return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust, stuck)
 
 
 def _stuck(
-    recording: Recording, motion: Motion, noise: Float[np.ndarray, " dof"]
+    time: Float[np.ndarray, " rows"],
+    measured: Float[np.ndarray, "rows dof"],
+    motion: Motion,
+    noise: Float[np.ndarray, " dof"],
 ) -> tuple[tuple[int, float, float], ...]:
     """Where a joint's torque is the same from row to row for long, while the nominal torque changes by far more
     than its noise and the steps it is written in."""
     out = []
-    if recording.tau is None:
-        return ()
-    for joint, tau in enumerate(recording.tau.T):
+    for joint, tau in enumerate(measured.T):
         steps = np.abs(np.diff(tau))
         written = float(np.min(steps[steps > 0], initial=np.inf))
         edges = np.flatnonzero(np.diff(np.r_[False, steps == 0, False]))
         for first, last in edges.reshape(-1, 2):
-            start, stop = float(recording.time[first]), float(recording.time[last])
-            inside = (motion.time >= start) & (motion.time <= stop)
-            if stop - start < _FROZEN or not inside.any():
+            start, stop = float(time[first]), float(time[last])
+            if stop - start < _FROZEN:
                 continue
-            if np.ptp(motion.torque[inside, joint]) > _MOVES * max(noise[joint], written):
+            inside = (motion.time >= start) & (motion.time <= stop)
+            if inside.any() and np.ptp(motion.torque[inside, joint]) > _MOVES * max(noise[joint], written):
                 out.append((joint, start, stop))
     return tuple(out)
 
