@@ -20,7 +20,7 @@ from jaxpanda.diagnosis.decide import titles
 from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check, inertial_spread
-from jaxpanda.diagnosis.noise import autoregression
+from jaxpanda.diagnosis.noise import autoregression, moments
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
 from jaxpanda.diagnosis.rivals import called, odds
@@ -387,7 +387,7 @@ def test_autoregression_recovers_the_noise_it_was_given():
     a, x = np.array([0.6, -0.3, 0.1]), np.zeros(20000)
     for i in range(3, len(x)):
         x[i] = a @ x[i - 3 : i][::-1] + 0.2 * rng.normal()
-    found, sigma, std = autoregression([x], 0)
+    found, sigma, std = autoregression(moments(x[:, None]), len(x))
     np.testing.assert_allclose(found, a, atol=0.03)
     assert sigma == pytest.approx(0.2, rel=0.03)
     assert std == pytest.approx(x.std(), rel=0.03)

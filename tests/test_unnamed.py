@@ -104,7 +104,7 @@ def test_a_torque_that_repeats_itself_while_the_arm_moves_is_told_with_its_times
         inside = (one.time >= start) & (one.time <= stop)
         one.tau[inside, 1] = one.tau[np.argmax(inside), 1]
     trace = prepare_trace(one, ARM)
-    found = stuck(pose((trace,), (True,), "exact").problem)
+    found = stuck(pose((trace,), (True,), "exact").problem, np.full(7, NOISE))
     assert found is not None
     assert (found.effect, found.joints) == ("unknown", (1,))
     np.testing.assert_allclose(found.intervals, frozen, atol=2 / RATE)

@@ -50,7 +50,7 @@ def findings(problem: Problem, state: State) -> list[Finding]:
     out = [_finding(problem, state, group, names[group[0]], rivals, doubt, spread) for group in groups]
     # what is in the band of the search belongs to what was found there
     lowest = {"lowest": problem.traces[0].cutoff} if out else {}
-    halted = stuck(problem)
+    halted = stuck(problem, state.noise.std)
     unnamed = hum([t.signals for t in problem.traces], problem.active, state.noise.std, **lowest)
     unnamed = unnamed or (None if out else standing_off(problem, state))
     return sorted(out, key=lambda f: -f.evidence) + [f for f in (halted, unnamed) if f is not None]

@@ -229,6 +229,7 @@ def diagnose(
             *premises.notes,
             *repairs,
             *(n for t in traces for n in _still(t)),
+            *_unheard(problem),
             *(n for t in traces for n in t.signals.notes),
             *warnings,
         ),
@@ -250,6 +251,18 @@ def _still(trace: Trace) -> list[str]:
     return [
         f"{trace.name}: {named} never moved; friction at rest may carry any part of the load there, so that"
         " torque was not judged"
+    ]
+
+
+def _unheard(problem: Problem) -> list[str]:
+    """A sentence about the joints that move, but of which too few samples count."""
+    moving = np.any([t.weights.any(0) for t in problem.traces], 0)
+    joints = [str(j + 1) for j in range(problem.dof) if moving[j] and not problem.saturation.tells(j)]
+    if not joints:
+        return []
+    return [
+        f"too few samples of joint{'s' * (len(joints) > 1)} {', '.join(joints)} can be used to tell physics from"
+        " noise, so that torque was not judged there"
     ]
 
 

@@ -16,6 +16,10 @@ from .host import parallel
 from .traces import Trace
 
 ORDER = 3
+LEAST_FREE = 0.25
+"""Share of a joint's samples that the saturated model must leave free for them to tell of noise."""
+QUIETEST = 1e-9
+"""Noise is taken for at least this [N m]."""
 _RANK = 1e-6  # least singular value that counts, as a share of the largest
 
 
@@ -32,7 +36,7 @@ class Saturation:
 
     def __init__(self, traces: Sequence[Trace]):
         self.traces = tuple(traces)
-        self._bases: dict[int, tuple[np.ndarray, float]] = {}
+        self._bases: dict[int, tuple[np.ndarray, float, np.ndarray]] = {}
 
     def columns(
         self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]] = ()
@@ -60,24 +64,54 @@ class Saturation:
         return A * self._weight(joint)[:, None]
 
     def left(
+        self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]] = ()
+    ) -> tuple[Float[np.ndarray, " _rows"], list[Float[np.ndarray, "_rows _n"]]]:
+        """What the model with `extra` columns leaves of the measured torque, and the bases of what it takes."""
+        U, largest, _ = self._basis(joint)
+        r = np.concatenate([t.residual[:, joint] for t in self.traces]) * self._weight(joint)
+        r = r - U @ (U.T @ r)
+        if not len(extra):
+            return r, [U]
+        E = np.concatenate(list(extra)) * self._weight(joint)[:, None]
+        largest = max(largest, float(np.linalg.norm(E, 2)))
+        for _ in range(2):  # once would leave rounding of what is taken off
+            E = E - U @ (U.T @ E)
+        V, s, _ = np.linalg.svd(E, full_matrices=False)
+        V = V[:, s > _RANK * largest]
+        return r - V @ (V.T @ r), [U, V]
+
+    def noise(
         self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]]
-    ) -> tuple[list[Float[np.ndarray, " _time"]], int]:
-        """What the model with `extra` columns leaves of the measured torque, and its degrees of freedom."""
+    ) -> tuple[np.ndarray, float, float]:
+        r"""`autoregression` of what the model with `extra` columns leaves, with what it took of noise put back.
+
+        Of white noise of variance $\sigma^2$ a model with orthonormal columns U takes
+        $\sigma^2 \sum_t U_{t-k} \cdot U_{t-l}$ of the moment of lags k and l: most where it is slow.
+        """
+        r, bases = self.left(joint, extra)
+        taken = sum((self.moments(V) for V in bases[1:]), self._basis(joint)[2])
+        count, used = float(np.sum(self._weight(joint) ** 2)), sum(U.shape[1] for U in bases)
+        variance = float(r @ r) / max(count - used, LEAST_FREE * count)
+        return autoregression(self.moments(r[:, None]) + variance * taken, count)
+
+    def tells(self, joint: int) -> bool:
+        """Whether the recordings are long enough for the model to leave noise of a joint to be seen."""
+        weight = self._weight(joint)
+        count = float(np.sum(weight**2))
+        return bool(weight.any()) and count - self._basis(joint)[0].shape[1] > LEAST_FREE * count
+
+    def _basis(self, joint: int) -> tuple[Float[np.ndarray, "_rows _n"], float, Float[np.ndarray, "_l _l"]]:
+        """Of the model's columns: a basis, the largest singular value, and the moments of the basis."""
         if joint not in self._bases:
             U, s, _ = np.linalg.svd(self.columns(joint), full_matrices=False)
-            self._bases[joint] = U[:, s > _RANK * s[0]], float(s[0])
-        U, largest = self._bases[joint]
-        r = np.concatenate([t.residual[:, joint] for t in self.traces]) * self._weight(joint)
-        r, used = r - U @ (U.T @ r), U.shape[1]
-        if len(extra):
-            E = np.concatenate(list(extra)) * self._weight(joint)[:, None]
-            largest = max(largest, float(np.linalg.norm(E, 2)))
-            for _ in range(2):  # once would leave rounding of what is taken off
-                E = E - U @ (U.T @ E)
-            V, s, _ = np.linalg.svd(E, full_matrices=False)
-            V = V[:, s > _RANK * largest]
-            r, used = r - V @ (V.T @ r), used + V.shape[1]
-        return np.split(r, np.cumsum([t.motion.samples for t in self.traces])[:-1]), used
+            U = U[:, s > _RANK * s[0]]
+            self._bases[joint] = U, float(s[0]), self.moments(U)
+        return self._bases[joint]
+
+    def moments(self, x: Float[np.ndarray, "_rows _n"]) -> Float[np.ndarray, "_lags _lags"]:
+        """`moments` of the recordings, one below the other."""
+        ends = np.cumsum([t.motion.samples for t in self.traces])[:-1]
+        return np.sum([moments(part) for part in np.split(x, ends)], 0)
 
     def _weight(self, joint: int) -> Float[np.ndarray, " _rows"]:
         return np.concatenate([t.weights[:, joint] for t in self.traces])
@@ -90,7 +124,8 @@ class Saturation:
         """
 
         def one(joint: int) -> list[np.ndarray]:
-            return strongest_order([t.motion.q[:, joint] for t in self.traces], self.left(joint, [])[0])
+            left = np.split(self.left(joint)[0], np.cumsum([t.motion.samples for t in self.traces])[:-1])
+            return strongest_order([t.motion.q[:, joint] for t in self.traces], left)
 
         for trace in self.traces:  # made once, before there are threads
             trace.motion.regressor, trace.motion.load, trace.shaken  # noqa: B018
@@ -111,17 +146,22 @@ def strongest_order(
     return [np.stack([np.sin(n * x), np.cos(n * x), np.sin(2 * n * x), np.cos(2 * n * x)], 1) for x in q]
 
 
+def moments(x: Float[np.ndarray, "_time _n"]) -> Float[np.ndarray, "_lags _lags"]:
+    r"""$\sum_t x_{t-k} \cdot x_{t-l}$ for the lags that an autoregression takes."""
+    now = [x[ORDER - k : len(x) - k] for k in range(ORDER + 1)]
+    return np.array([[np.vdot(a, b) for b in now] for a in now])
+
+
 def autoregression(
-    parts: Sequence[Float[np.ndarray, " _time"]], used: int
+    moments: Float[np.ndarray, "_lags _lags"], count: float
 ) -> tuple[np.ndarray, float, float]:
-    """Coefficients, deviation of the innovations, and deviation of the noise, by least squares."""
-    past = np.concatenate(
-        [np.stack([p[ORDER - 1 - k : len(p) - 1 - k] for k in range(ORDER)], 1) for p in parts]
-    )
-    now = np.concatenate([p[ORDER:] for p in parts])
-    ridge = 1e-6 * max(float(now @ now), 1e-12) * np.eye(ORDER)
-    a = np.linalg.solve(past.T @ past + ridge, past.T @ now)
-    innovation = now - past @ a
-    freedom = max(len(now) - used - ORDER, len(now) // 4)
-    sigma = float(np.sqrt(innovation @ innovation / freedom))
-    return a, max(sigma, 1e-9), float(np.sqrt(now @ now / freedom))
+    """Coefficients, deviation of the innovations, and deviation of the noise, by least squares.
+
+    Args:
+        moments: of the noise, summed over its samples.
+        count: how many those are.
+    """
+    S = moments / count
+    a = np.linalg.solve(S[1:, 1:] + 1e-6 * max(S[0, 0], 1e-12) * np.eye(ORDER), S[1:, 0])
+    b = np.concatenate([[1.0], -a])
+    return a, max(float(np.sqrt(max(b @ S @ b, 0.0))), QUIETEST), max(float(np.sqrt(S[0, 0])), QUIETEST)

@@ -13,11 +13,12 @@ from jaxtyping import Bool, Float
 
 from .. import signals as signals_
 from ..effects import AbstractEffect, AbstractJointEffect
+from ..errors import InputError
 from . import catchall
 from .evidence import Design, Noise, OnDemand
 from .host import parallel
 from .library import Candidates, build, columns_of
-from .noise import ORDER, Saturation, autoregression
+from .noise import ORDER, QUIETEST, Saturation
 from .scan import Block, Family, Score, Whitened, families, projected, scan
 from .traces import Trace
 
@@ -313,10 +314,10 @@ class Problem:
         """Noise that a saturated model with these terms leaves; of a joint it depends on what acts there."""
 
         def one(joint: int) -> tuple:
-            if not any(np.any(t.trust[:, joint]) for t in self.traces):
+            if joint not in heard:
                 taus = [t.signals.tau for t in self.traces if t.signals.tau is not None]
                 quiet = float(np.median([signals_.white_noise(tau)[joint] for tau in taus]))
-                return np.zeros(ORDER), _UNHEARD, quiet
+                return np.zeros(ORDER), _UNHEARD, max(quiet, QUIETEST)
             here = [t for t in (*self.background, *terms) if any(np.any(c[:, joint]) for c in t.columns)]
             key = joint, *(id(t) for t in here)
             if key not in self._noises:
@@ -324,11 +325,18 @@ class Problem:
                     np.concatenate([ripples[joint][r], *(t.columns[r][:, joint] for t in here)], 1)
                     for r in range(len(self.traces))
                 ]
-                parts, used = self.saturation.left(joint, extra)
-                self._noises[key] = (*autoregression(parts, used), here)  # keeps what it names alive
+                self._noises[key] = (*self.saturation.noise(joint, extra), here)  # keeps what it names alive
             return self._noises[key][:3]
 
         ripples = self.saturation.ripples  # made once, before there are threads
+        heard = {j for j in range(self.dof) if self.saturation.tells(j)}
+        if not heard:
+            samples = sum(np.count_nonzero(t.weights.any(1)) for t in self.traces)
+            names = ", ".join(t.name for t in self.traces)
+            raise InputError(
+                f"{names}: {samples} samples that can be used are too few to tell"
+                " physics from noise; record longer: with ends cut off, seven joints need about 2 s of motion"
+            )
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         return Noise(np.stack(a), np.array(sigma), np.array(std))
 

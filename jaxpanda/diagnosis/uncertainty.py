@@ -23,7 +23,7 @@ from scipy.signal import lfilter
 from ..effects import AbstractEffect
 from ..identification import statistics
 from .evidence import Design
-from .noise import autoregression
+from .noise import autoregression, moments
 from .problem import Problem, Term
 from .search import State, first_steps, moved, places, within
 
@@ -154,7 +154,7 @@ def _under_noise(design: Design) -> Float[np.ndarray, "n n"]:
     meat = np.diag(design.precision)
     for A, left in zip(design.columns, design.left, strict=True):
         if np.any(left):
-            a, sigma, _ = autoregression([left], 0)
+            a, sigma, _ = autoregression(moments(left[:, None]), len(left))
             # A^T Sigma A is the square of the columns run backwards through the noise's own filter
             coloured = np.asarray(lfilter([sigma], np.concatenate([[1.0], -a]), A[::-1], axis=0))
             meat = meat + coloured.T @ coloured

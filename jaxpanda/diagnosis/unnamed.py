@@ -44,7 +44,7 @@ def standing_off(problem: Problem, state: State) -> Finding | None:
     weights = np.concatenate([trace.weights for _, trace in suspect])
     # what stands off now and then passes for noise of a joint; its torque from sample to sample shows less
     white = np.median([white_noise(t.signals.tau) for t in problem.traces if t.signals.tau is not None], 0)
-    noise = np.minimum(state.noise.std, _COLOURED * white)
+    noise = np.minimum(state.noise.std, np.where(white > 0, _COLOURED * white, np.inf))  # 0: coarse steps
     weight = np.maximum(np.mean(weights**2, 0), 1e-9)
     beyond = np.mean((left / noise * weights) ** 2, 0) / weight
     joint = int(np.argmax(beyond))
@@ -77,8 +77,11 @@ def standing_off(problem: Problem, state: State) -> Finding | None:
     )
 
 
-def stuck(problem: Problem) -> Finding | None:
-    """Torque that repeats itself while the arm moves, in the recording that has most of it; None if none does."""
+def stuck(problem: Problem, std: Float[np.ndarray, " dof"]) -> Finding | None:
+    """Torque that repeats itself while the arm moves, in the recording that has most of it; None if none does.
+
+    `std`: deviation of each joint's noise [N m].
+    """
     suspect = [trace for trace, on in zip(problem.traces, problem.active, strict=True) if on]
     trace = max(suspect, key=lambda t: sum(stop - start for _, start, stop in t.stuck))
     if not trace.stuck:
@@ -89,8 +92,6 @@ def stuck(problem: Problem) -> Finding | None:
     for joint, start, stop in trace.stuck:
         inside = (trace.motion.time >= start) & (trace.motion.time <= stop)
         error[inside, joint] = trace.residual[inside, joint]
-    assert trace.signals.tau is not None
-    white = white_noise(trace.signals.tau)
     rms = np.sqrt((error**2).sum(0) / np.maximum((error != 0).sum(0), 1))
     return Finding(
         effect="unknown",
@@ -102,7 +103,7 @@ def stuck(problem: Problem) -> Finding | None:
         equation="tau = constant",
         parameters=(),
         rms_torque=rms,
-        evidence=float(0.5 * np.sum((error / white) ** 2)),
+        evidence=float(0.5 * np.sum((error / std) ** 2)),
         summary=f"The measured torque of joint{'s' * (len(joints) > 1)} "
         f"{', '.join(str(j + 1) for j in joints)} is stuck in {trace.name}, first from {when[0][0]:.2f} s to"
         f" {when[0][1]:.2f} s, while the arm moves: a sensor that repeats itself or is at its limit. What it gave"

@@ -1,0 +1,49 @@
+"""Noise of short recordings: a model with everything in it must not take it for structure."""
+
+import jax
+import numpy as np
+import pytest
+from helpers import excitation
+from jaxpanda_kernels import rnea
+
+from jaxpanda import Arm, InputError, Recording
+from jaxpanda.diagnosis import diagnose
+from jaxpanda.diagnosis.premises import pose
+from jaxpanda.diagnosis.traces import prepare
+
+ARM = Arm.panda()
+LOAD = jax.jit(jax.vmap(lambda q, qd, qdd: rnea(ARM.chain, ARM.standard, q, qd, qdd)))
+RATE, NOISE = 1000.0, 0.05
+
+
+def still_right(seconds: float, seed: int) -> Recording:
+    """The first seconds of a motion, and torque of which nothing is missing."""
+    rng, t = np.random.default_rng(seed), np.arange(0, 12, 1 / RATE)
+    q, qd, qdd = excitation(ARM, t, seed)
+    tau = np.asarray(LOAD(q, qd, qdd)) + NOISE * rng.normal(size=q.shape)
+    count = round(seconds * RATE)
+    return Recording("r.csv", t[:count], (q + 1e-5 * rng.normal(size=q.shape))[:count], tau=tau[:count])
+
+
+def noise_of(seconds: float, seed: int):
+    return pose((prepare(still_right(seconds, seed), ARM),), (True,), "exact").problem.noise(())
+
+
+def test_noise_of_a_short_recording_is_that_of_a_long_one():
+    long = noise_of(12.0, 0)
+    short = [noise_of(2.4, seed) for seed in range(4)]
+    sigma = np.mean([n.sigma for n in short], 0)
+    np.testing.assert_allclose(sigma, long.sigma, rtol=0.15)
+    slow = lambda n: n.sigma / (1 - n.a.sum(1))  # deviation of what is slow, where physics is looked for
+    np.testing.assert_allclose(np.mean([slow(n) for n in short], 0), slow(long), rtol=0.35)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_short_recording_raises_no_false_alarm(seed):
+    result = diagnose(None, [still_right(2.0 + 0.5 * seed, seed)], knowledge="exact")
+    assert (result.verdict, result.findings) == ("consistent", ())
+
+
+def test_too_short_a_recording_is_refused_with_what_would_do():
+    with pytest.raises(InputError, match=r"r\.csv: 40 samples .* record longer"):
+        diagnose(None, [still_right(1.2, 0)], knowledge="exact")
