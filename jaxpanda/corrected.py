@@ -1,5 +1,6 @@
 """The corrected model: the user's arm, what is now known better of it, and the effects that were missing."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -173,14 +174,18 @@ class Corrected(eqx.Module):
         )
         if np.any(np.asarray(self.change)):
             tau = tau + motion.regressor @ np.asarray(self.change).ravel()
-        for bound, c in zip(self.effects, self.coefficients, strict=True):
-            effect = bound.placed("", later=True)
-            if effect is None:
-                continue
-            if isinstance(effect, AbstractJointEffect):
-                tau[:, effect.joints[0]] += joint_columns([effect], channels, motion.dt)[:, 0] @ np.asarray(c)
-            else:
-                tau = tau + effect.over(motion) @ np.asarray(c)  # pyright: ignore
+        pairs = list(zip(self.effects, self.coefficients, strict=True))
+        for last in (False, True):
+            channels = dataclasses.replace(channels, shown=tau.copy() if last else None)
+            for bound, c in pairs:
+                effect = bound.placed("", later=True)
+                if effect is None or effect.takes_shown != last:
+                    continue
+                if isinstance(effect, AbstractJointEffect):
+                    columns = joint_columns([effect], channels, motion.dt)[:, 0]
+                    tau[:, effect.joints[0]] += columns @ np.asarray(c)
+                else:
+                    tau = tau + effect.over(motion) @ np.asarray(c)  # pyright: ignore
         return tau
 
     def to_json(self) -> dict[str, Any]:

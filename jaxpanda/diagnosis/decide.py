@@ -35,6 +35,8 @@ _TOUCHING = 0.15
 """Pause between events that happened at once [s]."""
 _LISTED = 0.01
 """Probability from which a rival is listed."""
+DOUBTFUL = 0.2
+"""Confidence below which what a finding stands for counts as not explained."""
 
 
 def findings(problem: Problem, state: State) -> list[Finding]:
@@ -44,16 +46,60 @@ def findings(problem: Problem, state: State) -> list[Finding]:
     before, after = leftover(state)
     left = np.clip(after / np.maximum(before, 1e-9), 0, 1) * (after > LEFT_CLEAR)
     names, where = titles(state.terms), shares(state)
-    doubt = CROWD ** np.maximum(0.0, crowd(where, names, [r[0] for r in rivals]) - 2)
+    each = list(names)  # what happened apart in time is not one law
+    for k, group in enumerate(groups):
+        for i in group:
+            if state.terms[i].effect.bound_to_recording:
+                each[i] = f"{names[i]} {k}"
+    doubt = CROWD ** np.maximum(0.0, crowd(where, each, [r[0] for r in rivals]) - 2)
     doubt = doubt * np.exp(-DOUBT * where @ left)
     spread = covariances(problem, state)
     out = [_finding(problem, state, group, names[group[0]], rivals, doubt, spread) for group in groups]
+    out = unnamed_where_doubtful(problem, state, out)
     # what is in the band of the search belongs to what was found there
     lowest = {"lowest": problem.traces[0].cutoff} if out else {}
     halted = stuck(problem, state.noise.std)
     unnamed = hum([t.signals for t in problem.traces], problem.active, state.noise.std, **lowest)
     unnamed = unnamed or (None if out else standing_off(problem, state))
     return sorted(out, key=lambda f: -f.evidence) + [f for f in (halted, unnamed) if f is not None]
+
+
+def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Finding]) -> list[Finding]:
+    """Of several findings those that are no likelier than `DOUBTFUL` made one that is `unknown`.
+
+    Laws that are called on together for what none of them is do not name it; they stand among the alternatives,
+    and in the model. One finding alone keeps its name: then no other law was called on.
+    """
+    doubtful = [f for f in found if f.effect != "unknown" and f.confidence < DOUBTFUL]
+    if not doubtful or len(found) == 1:
+        return list(found)
+    doubtful += [f for f in found if f.effect == "unknown"]
+    likely: dict[str, float] = {}
+    for name, p in [pair for f in doubtful for pair in ((f.effect, f.confidence), *f.alternatives)]:
+        if name != "unknown" and p >= _LISTED:
+            likely[name] = max(p, likely.get(name, 0.0))
+    terms = tuple(i for f in doubtful for i in f.terms)
+    parts = [torque(state, i) for i in terms]
+    felt = [np.sum([p[r] for p in parts], 0) for r, on in enumerate(problem.active) if on]
+    rms = np.sqrt(np.mean(np.concatenate(felt) ** 2, 0))
+    stand_ins = sorted({f.effect.replace("_", " ") for f in doubtful if f.effect != "unknown"})
+    strongest = int(np.argmax(rms))
+    one = Finding(
+        effect="unknown",
+        joints=tuple(sorted({j for f in doubtful for j in f.joints})),
+        recordings=tuple(dict.fromkeys(name for f in doubtful for name in f.recordings)),
+        intervals=None,
+        confidence=1.0 - max(likely.values(), default=0.005),
+        alternatives=tuple(sorted(likely.items(), key=lambda pair: -pair[1])[:4]),
+        equation="; ".join(dict.fromkeys(f.equation for f in doubtful)),
+        parameters=tuple(p for f in doubtful for p in f.parameters),
+        rms_torque=rms,
+        evidence=sum(f.evidence for f in doubtful),
+        summary=f"Joint {strongest + 1} shows {rms[strongest]:.3g} N·m rms that no named effect explains; in its"
+        f" place the model has what fits best, none of it likely: {', '.join(stand_ins)}.",
+        terms=terms,
+    )
+    return [*(f for f in found if all(f is not d for d in doubtful)), one]
 
 
 def crowd(

@@ -21,7 +21,7 @@ from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, load
 from . import knowledge as knowledge_
 from .coverage import HeatMap, Least, heat_map, least_shown
-from .decide import coefficients, findings, partly
+from .decide import DOUBTFUL, coefficients, findings, partly
 from .finding import Finding
 from .host import on_host
 from .localise import Localisation, localise, unbiased
@@ -35,8 +35,6 @@ from .uncertainty import polished
 CORRECTED = "corrected.json"
 """What `predict` reads."""
 NEXT_MOTION = "next_motion.csv"
-DOUBTFUL = 0.2
-"""Confidence of a finding below which what it stands for counts as not explained."""
 
 
 @dataclasses.dataclass(frozen=True)

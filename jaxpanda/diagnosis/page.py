@@ -162,7 +162,7 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
     fits = [np.asarray(f)[k, joint] for f, k in zip(own, rows, strict=True)]
     lefts = [a[k, joint] + f for a, k, f in zip(after, rows, fits, strict=True)]
     against = "time" if effect is None else _AGAINST.get(one.effect, "time")
-    if effect is not None and one.effect == "unknown":
+    if effect is not None and effect.name == "unknown":
         against = _of(effect)
     label, x, turned = _regime(found, effect, joint, against)
     signs = [s[k] for s, k in zip(turned, rows, strict=True)]

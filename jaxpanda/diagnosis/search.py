@@ -25,7 +25,7 @@ from .scan import scales_of
 
 SWAP = 3.0
 """Evidence that another effect must win by to take an accepted one's place [nats]."""
-SHADOW, EVENT_SHADOW = 0.03, 0.1
+SHADOW, EVENT_SHADOW = 0.03, 0.3
 """Share of a stronger term's evidence, in the joints and at the times where a weaker one acts, below which
 the weaker is taken for its shadow: for what the stronger's shape, never quite right, leaves over. Events in
 time, which fit any such leftover somewhere, need a larger share."""
@@ -300,13 +300,15 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
     share $s_{kj}$ of the stronger one's that acts in joint j while the term does. What is strong in one joint
     casts no shadow on another. A soft joint's swings and a gap's impacts come at moments that the fitted law has
     elsewhere: their shadow falls on all times. A contact as brief as the reversal of a joint could be all that a
-    stronger law has wrong there.
+    stronger law has wrong there. A free form of another joint's motion stands in that joint's shadow too.
     """
     energy = energies(state)
     total = np.maximum(energy.sum((1, 2)), 1e-300)
     out = []
     for i, term in enumerate(state.terms):
         where = energy[i].sum(1) / total[i]
+        if term.effect.name == "unknown" and hasattr(term.effect, "source"):
+            where[int(term.effect.source)] = 1.0
         once = term.effect.bound_to_recording
         rows = energy[i].any(0) if once else np.ones(energy.shape[2], bool)
         share = EVENT_SHADOW if once else SHADOW

@@ -181,10 +181,14 @@ def prepare(
     if stride > 1 and rough.tau is not None:
         tau = signals_.zero_phase(rough.tau, cutoff, rate)[keep]
     motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], held)
-    load = motion.load
-    if len(kept) < len(fine):
-        load = scipy.interpolate.CubicSpline(motion.time, load)(np.clip(time[fine], *motion.time[[0, -1]]))
-    channels = Channels(time[fine], q[fine], qd[fine], qdd[fine], load, load + held_fine)
+
+    def finely(x: np.ndarray) -> np.ndarray:
+        if len(kept) == len(fine):
+            return x
+        return scipy.interpolate.CubicSpline(motion.time, x)(np.clip(time[fine], *motion.time[[0, -1]]))
+
+    load, shown = finely(motion.load), None if tau is None else finely(tau)
+    channels = Channels(time[fine], q[fine], qd[fine], qdd[fine], load, load + held_fine, shown)
     weight = _weight(recording.time, time[keep], rate)
     trust = np.ones(motion.q.shape)
     if noise is not None:

@@ -154,7 +154,7 @@ def _under_noise(design: Design) -> Float[np.ndarray, "n n"]:
     meat = np.diag(design.precision)
     for A, left in zip(design.columns, design.left, strict=True):
         if np.any(left):
-            a, sigma, _ = autoregression(moments(left[:, None]), len(left))
+            a, sigma, _ = autoregression(moments(left[:, None]), float(len(left)))
             # A^T Sigma A is the square of the columns run backwards through the noise's own filter
             coloured = np.asarray(lfilter([sigma], np.concatenate([[1.0], -a]), A[::-1], axis=0))
             meat = meat + coloured.T @ coloured

@@ -48,13 +48,18 @@ class Armature(AbstractInstantEffect):
         return {"armature": {int(self.joint): c[0]}}
 
 
+_AROUND = (0.1, 0.3, 0.5, 0.7, 0.9)
+"""Where in its range a joint's cubic spring is told from."""
+
+
 class JointSpring(AbstractInstantEffect):
     r"""Torque that depends on joint position: a cable, a hose, a balancing spring.
 
     $$\tau_j = k\,q_j + b, \qquad \text{at rest at } q_0 = -b/k$$
 
-    Form "cubic" adds $k_2 q^2 + k_3 q^3$: a spring that stiffens away from where it rests. Form "centred" is
-    without b.
+    Form "cubic" adds $k_2 x^2 + k_3 x^3$: a spring that stiffens away from where it rests. There $x = q - $
+    `around`, which changes no torque: about zero a joint that moves far from it would need coefficients that
+    cancel, and no prior has those. Form "centred" is without b.
     """
 
     name: ClassVar[str] = "joint_spring"
@@ -63,10 +68,15 @@ class JointSpring(AbstractInstantEffect):
 
     joint: Joint
     form: str = eqx.field(static=True)
+    around: Float[Array, ""] | float = 0.0
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["JointSpring"]:
-        return [cls(j, form) for form in ("linear", "centred", "cubic") for j in range(arm.dof)]
+        out = [cls(j, form) for form in ("linear", "centred") for j in range(arm.dof)]
+        for j in range(arm.dof):
+            low, high = (float(np.clip(x[j], -np.pi, np.pi)) for x in (arm.lower, arm.upper))
+            out += [cls(j, "cubic", low + share * (high - low)) for share in _AROUND]
+        return out
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -84,14 +94,15 @@ class JointSpring(AbstractInstantEffect):
             + {
                 "linear": "stiffness * q + torque_at_zero",
                 "centred": "stiffness * q",
-                "cubic": "stiffness * q + torque_at_zero + quadratic * q^2 + cubic * q^3",
+                "cubic": "stiffness * x + torque_at_zero + quadratic * x^2 + cubic * x^3, x = q -"
+                f" {float(self.around):.4g}",
             }[self.form]
         )
 
     def at(self, s: Channels) -> Float[Array, " n"]:
         q = s.q[self.joint]
-        one = jnp.ones_like(q)
-        return jnp.stack({"linear": [q, one], "centred": [q], "cubic": [q, one, q**2, q**3]}[self.form])
+        x, one = q - self.around, jnp.ones_like(q)
+        return jnp.stack({"linear": [q, one], "centred": [q], "cubic": [x, one, x**2, x**3]}[self.form])
 
     def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         if self.form == "cubic" or arm.stiffness[int(self.joint)] != 0:

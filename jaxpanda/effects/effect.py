@@ -83,6 +83,8 @@ class AbstractEffect(eqx.Module):
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "plant"
     """What it changes in a simulation under given torque: how the arm moves (`resist`), what the position sensors
     show (`shift`), or what the torque sensors show (`sensed`)."""
+    takes_shown: ClassVar[bool] = False
+    """Whether it is a function of torque that the sensors show, and so of every other effect."""
     bound_to_recording: ClassVar[bool] = False
     """Whether it happened at some time in a recording; `placed` says what that means for others."""
 

@@ -28,6 +28,8 @@ class Channels(eqx.Module):
     """Torque that the nominal rigid arm transmits [N m]."""
     torque: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"]
     """Torque of the whole nominal model, friction included [N m]."""
+    shown: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"] | None = None
+    """Torque that the sensors show [N m]; None where they tell nothing, and the model's is the best there is."""
 
 
 class Motion:

@@ -161,12 +161,16 @@ class TorqueDrift(AbstractInstantEffect):
 
 
 class TorqueCrosstalk(AbstractInstantEffect):
-    r"""Torque of one joint appearing in another's sensor, $\tau_j = e\,\tau_k$."""
+    r"""Torque of one joint appearing in another's sensor, $\tau_j = e\,\tau_k$.
+
+    $\tau_k$ is what joint k's own sensor shows; the nominal torque lacks whatever else is missing there.
+    """
 
     name: ClassVar[str] = "torque_crosstalk"
     reveals: ClassVar[str] = "poses in which the two joints' torques differ"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction")
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
+    takes_shown: ClassVar[bool] = True
 
     joint: Joint
     source: Joint
@@ -184,7 +188,7 @@ class TorqueCrosstalk(AbstractInstantEffect):
         return f"tau = crosstalk_from_{int(self.source) + 1} * tau_{int(self.source) + 1}"
 
     def at(self, s: Channels) -> Float[Array, " n"]:
-        return s.torque[self.source][None]
+        return (s.torque if s.shown is None else s.shown)[self.source][None]
 
     def sensed(self, c, t, tau):
         return tau.at[:, self.joint].add(c[0] * tau[:, self.source])

@@ -1,0 +1,111 @@
+"""Which name a finding gets, and when it gets none."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_diagnosis import record
+
+from jaxpanda import Arm
+from jaxpanda.diagnosis import diagnose, predict
+from jaxpanda.diagnosis.decide import DOUBTFUL, unnamed_where_doubtful
+from jaxpanda.diagnosis.finding import Finding
+from jaxpanda.diagnosis.premises import pose
+from jaxpanda.diagnosis.search import ACCEPT, SHADOW, floors, grids, handicapped, start, with_terms
+from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.effects import Motion
+from jaxpanda.effects.drive import JointSpring
+from jaxpanda.effects.friction import CoulombFriction
+from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.effects.unknown import Unknown
+
+
+def posed(*recordings):
+    traces = tuple(prepare(one, Arm.panda()) for one in recordings)
+    return pose(traces, (True,) * len(traces), "exact").problem
+
+
+def test_crosstalk_carries_what_its_source_is_missing_too(tmp_path):
+    """With the nominal torque for the source's, the spring in joint 2 showed in joint 4 as another effect."""
+    spring = lambda q: 40.0 * (q[:, 1] - 0.5)
+
+    def both(t, q, qd, qdd):
+        torque = Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)).load[:, 1] + spring(q)
+        return spring(q)[:, None] * np.eye(7)[1] + 0.1 * torque[:, None] * np.eye(7)[3]
+
+    found = diagnose(None, [record(20, both), record(21, both)], knowledge="exact")
+    assert {(f.effect, f.joints) for f in found.findings} == {
+        ("joint_spring", (1,)),
+        ("torque_crosstalk", (3,)),
+    }
+    found.save(tmp_path)
+    later = record(22, both)
+    motion = dataclasses.replace(later, tau=None)
+    assert later.tau is not None
+    error = np.sqrt(np.mean((predict(tmp_path, motion) - later.tau)[100:-100, 3] ** 2))
+    assert error < 0.06  # the noise is 0.05
+
+
+def test_a_spring_that_stiffens_is_a_spring_wherever_the_joint_moves():
+    stiffens = lambda t, q, qd, qdd: (
+        np.eye(7)[3] * (3.0 * (q[:, 3] + 1.6) + 40.0 * (q[:, 3] + 1.6) ** 3)[:, None]
+    )
+    problem = posed(record(5, stiffens), record(6, stiffens))
+    state = start(problem)
+    springs = grids(
+        problem, state.design, state.noise, [g for g in problem.library if g.name == "joint_spring"]
+    )
+    free = grids(problem, state.design, state.noise, [g for g in problem.catchalls if g.joint == 3])
+    spring = max(springs, key=lambda p: p.evidence)
+    assert isinstance(spring.effect, JointSpring)
+    assert (spring.effect.form, spring.effect.joint) == ("cubic", 3)
+    assert spring.evidence > max(handicapped(p).evidence for p in free)
+
+
+def test_a_curve_of_another_joint_s_motion_stands_in_that_joint_s_shadow():
+    """What a filter leaves of joint 2's reversals shows in joint 4, as a function of joint 2's velocity."""
+    problem = posed(record(3, lambda t, q, qd, qdd: np.tanh(qd / 0.01) * (np.arange(7) == 1)))
+    friction = problem.term(CoulombFriction(1, 0.01), np.array([0.5]))
+    knots = (0.0, 0.1, 0.2)
+    coupled = problem.term(Unknown(3, 1, knots, "odd in dq_k"), np.full(3, 0.1))
+    own = problem.term(Unknown(3, 3, knots, "odd in dq"), np.full(3, 0.1))
+    gained = [1e5, 100.0]
+    assert floors(with_terms(problem, [friction, coupled]), gained)[1] == pytest.approx(
+        SHADOW * 1e5, rel=1e-6
+    )
+    assert floors(with_terms(problem, [friction, own]), gained)[1] == pytest.approx(ACCEPT)
+
+
+def test_several_laws_of_which_none_is_likely_are_one_unknown():
+    problem = posed(record(3))
+    terms = [problem.term(CoulombFriction(1, 0.01), np.ones(1)), problem.term(TorqueOffset(4), np.ones(1))]
+    terms.append(problem.term(TorqueOffset(2), np.ones(1)))
+    state = with_terms(problem, terms)
+
+    def finding(i, confidence):
+        effect = terms[i].effect
+        return Finding(
+            effect=effect.name,
+            joints=effect.joints,
+            recordings=("motion_3.csv",),
+            intervals=None,
+            confidence=confidence,
+            alternatives=(("joint_spring", 0.1),),
+            equation=effect.equation,
+            parameters=(),
+            rms_torque=np.zeros(7),
+            evidence=100.0 - i,
+            summary="",
+            terms=(i,),
+        )
+
+    sure, doubtful = finding(2, 0.9), [finding(0, 0.5 * DOUBTFUL), finding(1, 0.25 * DOUBTFUL)]
+    named, unknown = unnamed_where_doubtful(problem, state, [sure, *doubtful])
+    assert named is sure
+    assert (unknown.effect, unknown.joints, unknown.terms) == ("unknown", (1, 4), (0, 1))
+    assert unknown.confidence == pytest.approx(1 - 0.5 * DOUBTFUL)
+    assert dict(unknown.alternatives)["coulomb_friction"] == pytest.approx(0.5 * DOUBTFUL)
+    assert unknown.evidence == pytest.approx(199.0)
+    assert np.all(unknown.rms_torque[[1, 4]] > 0)
+    assert "coulomb friction, torque offset" in unknown.summary
+    assert unnamed_where_doubtful(problem, state, doubtful[:1]) == doubtful[:1]
