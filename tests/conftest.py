@@ -1,4 +1,7 @@
-"""Strict in tests, relaxed for users: float64, warnings as errors, shapes checked at run time."""
+"""Strict in tests, relaxed for users: float64, warnings as errors, shapes checked at run time.
+
+What XLA compiled is kept in `.pytest_cache`, for the workers to share and for the next run.
+"""
 
 import os
 from pathlib import Path
@@ -7,6 +10,12 @@ import jax
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.cache is not None:
+        jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,11 @@ from jaxpanda_kernels import Chain, inertia
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from jaxpanda import Arm
+from jaxpanda import Arm, Recording
+from jaxpanda.effects import Motion
+
+NOISE = 0.05
+"""Of the torque that `record` makes [N m]."""
 
 
 def random_chain(seed: int, dof: int) -> Chain:
@@ -49,6 +53,24 @@ def excitation(arm: Arm, t: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarr
     qd = (w * np.cos(w * t)).T @ a - (w * np.sin(w * t)).T @ b
     qdd = -(w**2 * np.sin(w * t)).T @ a - (w**2 * np.cos(w * t)).T @ b
     return q, qd, qdd
+
+
+def record(
+    seed: int, extra=None, *, seconds: float = 8.0, rate: float = 200.0, arm: Arm | None = None
+) -> Recording:
+    """A Fourier motion of the project's Panda with noise of 0.05 N m; `extra` is added to the torque."""
+    arm, rng = arm or Arm.panda(), np.random.default_rng(seed)
+    t = np.arange(int(seconds * rate)) / rate
+    w = 2 * np.pi * np.array([0.1, 0.2, 0.3, 0.5])
+    a, b = rng.normal(0, 0.12, (2, 4, 7)) / np.array([1, 1.5, 2, 3])[:, None]
+    phase = w[:, None] * t
+    q = 0.5 * np.asarray(arm.lower + arm.upper) + np.sin(phase).T @ a + np.cos(phase).T @ b
+    qd = (w[:, None] * np.cos(phase)).T @ a - (w[:, None] * np.sin(phase)).T @ b
+    qdd = -((w**2)[:, None] * np.sin(phase)).T @ a - ((w**2)[:, None] * np.cos(phase)).T @ b
+    tau = Motion(arm, t, q, qd, qdd, np.zeros_like(q)).load + NOISE * rng.normal(size=q.shape)
+    if extra is not None:
+        tau = tau + extra(t, q, qd, qdd)
+    return Recording(f"motion_{seed}.csv", t, q + 1e-5 * rng.normal(size=q.shape), qd=qd, tau=tau)
 
 
 def half_correlated(rng: np.random.Generator, shape: tuple[int, ...], keep: float) -> np.ndarray:

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_diagnosis import record
+from helpers import record
 
 from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict

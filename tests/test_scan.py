@@ -94,7 +94,7 @@ def test_held_out_errors_are_those_of_fits_without_the_block(problem: Problem):
 
 
 def test_noise_is_estimated_anew_only_where_a_term_acts(problem: Problem):
-    term = problem.term(CoulombFriction(3, 0.01), np.array([0.3]))
+    term = problem.term(CoulombFriction(3, 0.2), np.array([0.3]))
     without, beside = problem.noise(()), problem.noise((term,))
     assert np.array_equal(np.delete(without.sigma, 3), np.delete(beside.sigma, 3))
     assert without.sigma[3] != beside.sigma[3]
