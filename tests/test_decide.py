@@ -8,7 +8,7 @@ from helpers import record
 
 from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict
-from jaxpanda.diagnosis.decide import DOUBTFUL, unnamed_where_doubtful
+from jaxpanda.diagnosis.decide import UNLIKELY, unnamed_where_doubtful
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.search import ACCEPT, SHADOW, floors, grids, handicapped, start, with_terms
@@ -90,7 +90,7 @@ def test_several_laws_of_which_none_is_likely_are_one_unknown():
             recordings=("motion_3.csv",),
             intervals=None,
             confidence=confidence,
-            alternatives=(("joint_spring", 0.1),),
+            alternatives=(("joint_spring", 0.01),),
             equation=effect.equation,
             parameters=(),
             rms_torque=np.zeros(7),
@@ -99,13 +99,15 @@ def test_several_laws_of_which_none_is_likely_are_one_unknown():
             terms=(i,),
         )
 
-    sure, doubtful = finding(2, 0.9), [finding(0, 0.5 * DOUBTFUL), finding(1, 0.25 * DOUBTFUL)]
+    sure, doubtful = finding(2, 0.9), [finding(0, 0.5 * UNLIKELY), finding(1, 0.25 * UNLIKELY)]
     named, unknown = unnamed_where_doubtful(problem, state, [sure, *doubtful])
     assert named is sure
     assert (unknown.effect, unknown.joints, unknown.terms) == ("unknown", (1, 4), (0, 1))
-    assert unknown.confidence == pytest.approx(1 - 0.5 * DOUBTFUL)
-    assert dict(unknown.alternatives)["coulomb_friction"] == pytest.approx(0.5 * DOUBTFUL)
+    assert unknown.confidence == pytest.approx(1 - 0.5 * UNLIKELY)
+    assert dict(unknown.alternatives)["coulomb_friction"] == pytest.approx(0.5 * UNLIKELY)
     assert unknown.evidence == pytest.approx(199.0)
     assert np.all(unknown.rms_torque[[1, 4]] > 0)
     assert "coulomb friction, torque offset" in unknown.summary
     assert unnamed_where_doubtful(problem, state, doubtful[:1]) == doubtful[:1]
+    rivalled = dataclasses.replace(doubtful[0], alternatives=(("joint_spring", 0.9),))
+    assert unnamed_where_doubtful(problem, state, [sure, rivalled]) == [sure, rivalled]

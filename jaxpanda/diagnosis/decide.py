@@ -37,6 +37,8 @@ _LISTED = 0.01
 """Probability from which a rival is listed."""
 DOUBTFUL = 0.2
 """Confidence below which what a finding stands for counts as not explained."""
+UNLIKELY = 0.1
+"""Confidence below which one of several findings loses its name."""
 
 
 def findings(problem: Problem, state: State) -> list[Finding]:
@@ -65,19 +67,20 @@ def findings(problem: Problem, state: State) -> list[Finding]:
 
 
 def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Finding]) -> list[Finding]:
-    """Of several findings those that are no likelier than `DOUBTFUL` made one that is `unknown`.
+    """Of several findings those that neither they nor a rival names with `UNLIKELY` made one that is `unknown`.
 
     Laws that are called on together for what none of them is do not name it; they stand among the alternatives,
     and in the model. One finding alone keeps its name: then no other law was called on.
     """
-    doubtful = [f for f in found if f.effect != "unknown" and f.confidence < DOUBTFUL]
+    names = {id(f): ((f.effect, f.confidence), *f.alternatives) for f in found if f.effect != "unknown"}
+    doubtful = [f for f in found if id(f) in names and all(p < UNLIKELY for _, p in names[id(f)])]
     if not doubtful or len(found) == 1:
         return list(found)
-    doubtful += [f for f in found if f.effect == "unknown"]
     likely: dict[str, float] = {}
-    for name, p in [pair for f in doubtful for pair in ((f.effect, f.confidence), *f.alternatives)]:
-        if name != "unknown" and p >= _LISTED:
+    for name, p in [pair for f in doubtful for pair in names[id(f)]]:
+        if p >= _LISTED:
             likely[name] = max(p, likely.get(name, 0.0))
+    doubtful += [f for f in found if f.effect == "unknown"]
     terms = tuple(i for f in doubtful for i in f.terms)
     parts = [torque(state, i) for i in terms]
     felt = [np.sum([p[r] for p in parts], 0) for r, on in enumerate(problem.active) if on]

@@ -15,6 +15,7 @@ from ..effects.drive import Backlash, JointElasticity
 from ..effects.effect import AbstractDryFriction
 from ..effects.friction import AsymmetricFriction
 from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
+from ..effects.unknown import Unknown
 from .events import BIN, Proposal, ripple, windows
 from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
 from .host import parallel
@@ -25,7 +26,7 @@ from .scan import scales_of
 
 SWAP = 3.0
 """Evidence that another effect must win by to take an accepted one's place [nats]."""
-SHADOW, EVENT_SHADOW = 0.03, 0.3
+SHADOW, EVENT_SHADOW = 0.03, 0.5
 """Share of a stronger term's evidence, in the joints and at the times where a weaker one acts, below which
 the weaker is taken for its shadow: for what the stronger's shape, never quite right, leaves over. Events in
 time, which fit any such leftover somewhere, need a larger share."""
@@ -307,7 +308,7 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
     out = []
     for i, term in enumerate(state.terms):
         where = energy[i].sum(1) / total[i]
-        if term.effect.name == "unknown" and hasattr(term.effect, "source"):
+        if isinstance(term.effect, Unknown):
             where[int(term.effect.source)] = 1.0
         once = term.effect.bound_to_recording
         rows = energy[i].any(0) if once else np.ones(energy.shape[2], bool)
