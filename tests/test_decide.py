@@ -10,6 +10,7 @@ from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.decide import UNLIKELY, unnamed_where_doubtful
 from jaxpanda.diagnosis.finding import Finding
+from jaxpanda.diagnosis.next_motion import next_motion
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.search import ACCEPT, SHADOW, floors, grids, handicapped, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
@@ -99,15 +100,17 @@ def test_several_laws_of_which_none_is_likely_are_one_unknown():
             terms=(i,),
         )
 
-    sure, doubtful = finding(2, 0.9), [finding(0, 0.5 * UNLIKELY), finding(1, 0.25 * UNLIKELY)]
+    sure, doubtful = finding(2, 0.9), [finding(0, 0.9 * UNLIKELY), finding(1, 0.25 * UNLIKELY)]
     named, unknown = unnamed_where_doubtful(problem, state, [sure, *doubtful])
     assert named is sure
     assert (unknown.effect, unknown.joints, unknown.terms) == ("unknown", (1, 4), (0, 1))
-    assert unknown.confidence == pytest.approx(1 - 0.5 * UNLIKELY)
-    assert dict(unknown.alternatives)["coulomb_friction"] == pytest.approx(0.5 * UNLIKELY)
+    assert unknown.confidence == pytest.approx(1 - 0.9 * UNLIKELY)
+    assert dict(unknown.alternatives)["coulomb_friction"] == pytest.approx(0.9 * UNLIKELY)
     assert unknown.evidence == pytest.approx(199.0)
     assert np.all(unknown.rms_torque[[1, 4]] > 0)
     assert "coulomb friction, torque offset" in unknown.summary
+    assert unknown.parameters == ()
+    assert next_motion(problem, state, [unknown], np.zeros((70, 1)), "exact") is None
     assert unnamed_where_doubtful(problem, state, doubtful[:1]) == doubtful[:1]
     rivalled = dataclasses.replace(doubtful[0], alternatives=(("joint_spring", 0.9),))
     assert unnamed_where_doubtful(problem, state, [sure, rivalled]) == [sure, rivalled]

@@ -69,8 +69,9 @@ def findings(problem: Problem, state: State) -> list[Finding]:
 def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Finding]) -> list[Finding]:
     """Of several findings those that neither they nor a rival names with `UNLIKELY` made one that is `unknown`.
 
-    Laws that are called on together for what none of them is do not name it; they stand among the alternatives,
-    and in the model. One finding alone keeps its name: then no other law was called on.
+    Laws that are called on together for what none of them is do not name it, and their parameters mean nothing;
+    they stand among the alternatives, and in the model. One finding alone keeps its name: then no other law was
+    called on.
     """
     names = {id(f): ((f.effect, f.confidence), *f.alternatives) for f in found if f.effect != "unknown"}
     doubtful = [f for f in found if id(f) in names and all(p < UNLIKELY for _, p in names[id(f)])]
@@ -95,7 +96,7 @@ def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Findi
         confidence=1.0 - max(likely.values(), default=0.005),
         alternatives=tuple(sorted(likely.items(), key=lambda pair: -pair[1])[:4]),
         equation="; ".join(dict.fromkeys(f.equation for f in doubtful)),
-        parameters=tuple(p for f in doubtful for p in f.parameters),
+        parameters=(),
         rms_torque=rms,
         evidence=sum(f.evidence for f in doubtful),
         summary=f"Joint {strongest + 1} shows {rms[strongest]:.3g} N·m rms that no named effect explains; in its"

@@ -189,7 +189,8 @@ def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
         return []
     i = max(finding.terms, key=lambda i: float(np.sum(state.terms[i].columns[0] ** 2)))
     term = state.terms[i]
-    if not rivals or term.effect.bound_to_recording:
+    stands_in = finding.effect == "unknown" != term.effect.name
+    if not rivals or stands_in or term.effect.bound_to_recording:
         return []
     others = (*state.terms[:i], *state.terms[i + 1 :])
     design = problem.design(others, state.noise)
