@@ -94,8 +94,8 @@ class JointSpring(AbstractInstantEffect):
             + {
                 "linear": "stiffness * q + torque_at_zero",
                 "centred": "stiffness * q",
-                "cubic": "stiffness * x + torque_at_zero + quadratic * x^2 + cubic * x^3, x = q -"
-                f" {float(self.around):.4g}",
+                "cubic": "stiffness * x + torque_at_zero + quadratic * x^2 + cubic * x^3, x = q"
+                f" {-float(self.around):+.4g}",
             }[self.form]
         )
 
