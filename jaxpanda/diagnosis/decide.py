@@ -83,8 +83,7 @@ def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Findi
             likely[name] = max(p, likely.get(name, 0.0))
     doubtful += [f for f in found if f.effect == "unknown"]
     terms = tuple(i for f in doubtful for i in f.terms)
-    parts = [torque(state, i) for i in terms]
-    felt = [np.sum([p[r] for p in parts], 0) for r, on in enumerate(problem.active) if on]
+    felt = [x for x, on in zip(torque(state, *terms), problem.active, strict=True) if on]
     rms = np.sqrt(np.mean(np.concatenate(felt) ** 2, 0))
     stand_ins = sorted({f.effect.replace("_", " ") for f in doubtful if f.effect != "unknown"})
     strongest = int(np.argmax(rms))
@@ -194,10 +193,10 @@ def coefficients(state: State, i: int) -> Float[np.ndarray, " n"]:
     return state.design.x[places(state)[i]]
 
 
-def torque(state: State, i: int) -> list[Float[np.ndarray, "_time dof"]]:
-    """Torque of a term in each recording [N m]."""
-    c = coefficients(state, i)
-    return [columns @ c for columns in state.terms[i].columns]
+def torque(state: State, *members: int) -> list[Float[np.ndarray, "_time dof"]]:
+    """Torque of terms together in each recording [N m]."""
+    parts = [[columns @ coefficients(state, i) for columns in state.terms[i].columns] for i in members]
+    return [np.sum(of_one, 0) for of_one in zip(*parts, strict=True)]
 
 
 def _finding(
@@ -214,8 +213,7 @@ def _finding(
     joints = tuple(sorted({j for t in terms for j in t.effect.joints}))
     if effect.bound_to_recording:  # what happened at once happened at one place
         joints = terms[int(np.argmax([rivals[i][0] for i in members]))].effect.joints
-    parts = [torque(state, i) for i in members]
-    together = [np.sum([part[r] for part in parts], 0) for r in range(len(problem.traces))]
+    together = torque(state, *members)
     names = [t.name for t, on in zip(problem.traces, problem.active, strict=True) if on]
     intervals = None
     acting = [np.ones(len(x), bool) for x in together]

@@ -189,7 +189,7 @@ def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
         return []
     i = max(finding.terms, key=lambda i: float(np.sum(state.terms[i].columns[0] ** 2)))
     term = state.terms[i]
-    stands_in = finding.effect == "unknown" != term.effect.name
+    stands_in = finding.effect == "unknown" and term.effect.name != "unknown"
     if not rivals or stands_in or term.effect.bound_to_recording:
         return []
     others = (*state.terms[:i], *state.terms[i + 1 :])

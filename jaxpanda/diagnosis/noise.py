@@ -110,8 +110,11 @@ class Saturation:
 
     def moments(self, x: Float[np.ndarray, "_rows _n"]) -> Float[np.ndarray, "_lags _lags"]:
         """`moments` of the recordings, one below the other."""
-        ends = np.cumsum([t.motion.samples for t in self.traces])[:-1]
-        return np.sum([moments(part) for part in np.split(x, ends)], 0)
+        return np.sum([moments(part) for part in self._apart(x)], 0)
+
+    def _apart(self, x: Float[np.ndarray, "_rows ..."]) -> list[Float[np.ndarray, "_time ..."]]:
+        """The rows of each recording."""
+        return np.split(x, np.cumsum([t.motion.samples for t in self.traces])[:-1])
 
     def _weight(self, joint: int) -> Float[np.ndarray, " _rows"]:
         return np.concatenate([t.weights[:, joint] for t in self.traces])
@@ -124,8 +127,8 @@ class Saturation:
         """
 
         def one(joint: int) -> list[np.ndarray]:
-            left = np.split(self.left(joint)[0], np.cumsum([t.motion.samples for t in self.traces])[:-1])
-            return strongest_order([t.motion.q[:, joint] for t in self.traces], left)
+            left, _ = self.left(joint)
+            return strongest_order([t.motion.q[:, joint] for t in self.traces], self._apart(left))
 
         for trace in self.traces:  # made once, before there are threads
             trace.motion.regressor, trace.motion.load, trace.shaken  # noqa: B018

@@ -335,7 +335,7 @@ class Problem:
             names = ", ".join(t.name for t in self.traces)
             raise InputError(
                 f"{names}: {samples} samples that can be used are too few to tell"
-                " physics from noise; record longer: with ends cut off, seven joints need about 2 s of motion"
+                " physics from noise; record longer: of seven joints 2 s at 100 Hz or more are enough"
             )
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         return Noise(np.stack(a), np.array(sigma), np.array(std))
