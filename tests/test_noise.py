@@ -1,5 +1,7 @@
 """Noise of short recordings: a model with everything in it must not take it for structure."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from jaxpanda_kernels import rnea
 
 from jaxpanda import Arm, InputError, Recording
 from jaxpanda.diagnosis import diagnose
+from jaxpanda.diagnosis.diagnosis import _unheard
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.traces import prepare
 
@@ -47,3 +50,15 @@ def test_a_short_recording_raises_no_false_alarm(seed):
 def test_too_short_a_recording_is_refused_with_what_would_do():
     with pytest.raises(InputError, match=r"r\.csv: 40 samples .* record longer"):
         diagnose(None, [still_right(1.2, 0)], knowledge="exact")
+
+
+def test_a_joint_of_which_too_little_counts_is_not_judged_and_that_is_said():
+    trace = prepare(still_right(4.0, 0), ARM)
+    trust = trace.trust.copy()
+    trust[20:, 4] = 0.0
+    problem = pose((dataclasses.replace(trace, trust=trust),), (True,), "exact").problem
+    assert [problem.saturation.tells(j) for j in range(7)] == [j != 4 for j in range(7)]
+    sigma = problem.noise(()).sigma
+    assert sigma[4] > 1e6 * np.delete(sigma, 4).max()
+    (said,) = _unheard(problem)
+    assert said.startswith("too few samples of joint 5 can be used")
