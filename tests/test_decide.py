@@ -8,7 +8,7 @@ from helpers import record
 
 from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict
-from jaxpanda.diagnosis.decide import UNLIKELY, unnamed_where_doubtful
+from jaxpanda.diagnosis.decide import MISLEADS, UNLIKELY, findings, unnamed_where_doubtful
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.next_motion import next_motion
 from jaxpanda.diagnosis.premises import pose
@@ -75,6 +75,23 @@ def test_a_curve_of_another_joint_s_motion_stands_in_that_joint_s_shadow():
         SHADOW * 1e5, rel=1e-6
     )
     assert floors(with_terms(problem, [friction, own]), gained)[1] == pytest.approx(ACCEPT)
+
+
+def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_doubted():
+    problem = posed(record(7, lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) == 1)))
+    state = with_terms(problem, [problem.term(CoulombFriction(1, 0.01), np.array([0.5]))])
+    (sure,), (doubtful,) = findings(problem, state, state.terms), findings(problem, state, ())
+    assert sure.confidence > 0.9
+    assert doubtful.confidence == pytest.approx(MISLEADS * sure.confidence, rel=0.01)
+
+
+def test_what_each_recording_shows_otherwise_is_not_explained():
+    """The same curve of position with the other sign a day later is no physics of the arm."""
+    day = lambda sign: lambda t, q, qd, qdd: sign * 0.3 * np.sin(2 * q[:, [4]]) * np.eye(7)[4]
+    found = diagnose(None, [record(30, day(1)), record(31, day(-1))], knowledge="exact")
+    assert any("predicted no better" in note for note in found.notes)
+    assert found.verdict in ("partly_explained", "unexplained")
+    assert all(f.confidence <= MISLEADS for f in found.findings if f.effect != "unknown")
 
 
 def test_several_laws_of_which_none_is_likely_are_one_unknown():

@@ -205,8 +205,8 @@ def diagnose(
         if other is state:
             break
         state = polished(problem, other)
-    found = tuple(findings(problem, state))
     kept = transferable(problem, state)
+    found = tuple(findings(problem, state, kept.terms))
     corrected = _corrected(arm, premises, kept)
     dropped = [t.effect.name.replace("_", " ") for t in state.terms if all(t is not k for k in kept.terms)]
     if dropped:

@@ -5,6 +5,7 @@ correlated noise, and hide it. A saturated fit (rigid body with free parameters,
 velocity, load and time) takes any effect away first, as well as it can, at the price of its degrees of freedom.
 """
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 
@@ -16,8 +17,10 @@ from .host import parallel
 from .traces import Trace
 
 ORDER = 3
-LEAST_FREE = 0.25
-"""Share of a joint's samples that the saturated model must leave free for them to tell of noise."""
+LEAST_FREE, FEWEST_FREE = 0.25, 25.0
+"""Share of a joint's samples that the saturated model must leave free for them to tell of noise, and how many."""
+DETAILS = (1.0, 0.6, 0.35, 0.2)
+"""Shares of the knots that its smooth functions have; the first that leaves so much free is taken."""
 QUIETEST = 1e-9
 """Noise is taken for at least this [N m]."""
 _RANK = 1e-6  # least singular value that counts, as a share of the largest
@@ -31,20 +34,43 @@ def hats(x: Float[np.ndarray, " _time"], count: int) -> Float[np.ndarray, "_time
     return np.stack([np.interp(x, knots, e) for e in np.eye(len(knots))], 1)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Basis:
+    """Of the columns of a joint's saturated model."""
+
+    detail: float
+    U: Float[np.ndarray, "rows n"]
+    """Orthonormal."""
+    largest: float
+    """Singular value."""
+    taken: Float[np.ndarray, "lags lags"]
+    """What the model takes of the moments of white noise of unit variance."""
+    leaves_enough: bool
+
+
 class Saturation:
-    """The saturated model of some recordings, joint by joint: one below the other, zero in their gaps."""
+    """The saturated model of some recordings, joint by joint: one below the other, zero in their gaps.
+
+    Of a joint with few samples it is coarser. What it then leaves of an effect passes for noise: the effect may
+    be missed, but none is invented.
+    """
 
     def __init__(self, traces: Sequence[Trace]):
         self.traces = tuple(traces)
-        self._bases: dict[int, tuple[np.ndarray, float, np.ndarray]] = {}
+        self._bases: dict[int, _Basis] = {}
 
     def columns(
-        self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]] = ()
+        self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]] = (), detail: float | None = None
     ) -> Float[np.ndarray, "_rows _n"]:
-        """All columns of a joint, `extra` ones of each recording last."""
+        """All columns of a joint, `extra` ones of each recording last; in as much detail as samples allow."""
+        if detail is None:
+            detail = self._basis(joint).detail
 
         def stacked(part) -> np.ndarray:
             return np.concatenate([np.asarray(part(trace)) for trace in self.traces])
+
+        def knots(count: int) -> int:
+            return round(detail * count)
 
         traces = self.traces
         Q, s, _ = np.linalg.svd(stacked(lambda t: t.motion.regressor[:, joint]), full_matrices=False)
@@ -55,11 +81,11 @@ class Saturation:
         rates = [np.gradient(t.motion.load[:, joint], t.motion.dt) for t in traces]
         bends = [np.gradient(rate, t.motion.dt) for rate, t in zip(rates, traces, strict=True)]
         swings = np.stack([np.concatenate(rates), np.concatenate(bends)], 1)
-        speed = hats(np.abs(qd), 8)
-        clock = scipy.linalg.block_diag(*[hats(t.motion.time, 10) for t in traces])
+        speed = hats(np.abs(qd), knots(8))
+        clock = scipy.linalg.block_diag(*[hats(t.motion.time, knots(10)) for t in traces])
         shaken = stacked(lambda t: t.shaken[:, joint])
-        smooth = [rigid, shaken, hats(q, 10), speed, hats(load, 5), swings, clock]
-        rough = [sign[:, None] * x for x in (speed, hats(q, 4), hats(load, 3), clock[:, ::2])]
+        smooth = [rigid, shaken, hats(q, knots(10)), speed, hats(load, knots(5)), swings, clock]
+        rough = [sign[:, None] * x for x in (speed, hats(q, knots(4)), hats(load, knots(3)), clock[:, ::2])]
         A = np.concatenate([*smooth, *rough, *([np.concatenate(list(extra))] if len(extra) else [])], 1)
         return A * self._weight(joint)[:, None]
 
@@ -67,7 +93,8 @@ class Saturation:
         self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]] = ()
     ) -> tuple[Float[np.ndarray, " _rows"], list[Float[np.ndarray, "_rows _n"]]]:
         """What the model with `extra` columns leaves of the measured torque, and the bases of what it takes."""
-        U, largest, _ = self._basis(joint)
+        basis = self._basis(joint)
+        U, largest = basis.U, basis.largest
         r = np.concatenate([t.residual[:, joint] for t in self.traces]) * self._weight(joint)
         r = r - U @ (U.T @ r)
         if not len(extra):
@@ -89,24 +116,36 @@ class Saturation:
         $\sigma^2 \sum_t U_{t-k} \cdot U_{t-l}$ of the moment of lags k and l: most where it is slow.
         """
         r, bases = self.left(joint, extra)
-        taken = sum((self.moments(V) for V in bases[1:]), self._basis(joint)[2])
-        count, used = float(np.sum(self._weight(joint) ** 2)), sum(U.shape[1] for U in bases)
+        taken = sum((self.moments(V) for V in bases[1:]), self._basis(joint).taken)
+        count, used = self._count(joint), sum(U.shape[1] for U in bases)
         variance = float(r @ r) / max(count - used, LEAST_FREE * count)
         return autoregression(self.moments(r[:, None]) + variance * taken, count)
 
     def tells(self, joint: int) -> bool:
         """Whether the recordings are long enough for the model to leave noise of a joint to be seen."""
-        weight = self._weight(joint)
-        count = float(np.sum(weight**2))
-        return bool(weight.any()) and count - self._basis(joint)[0].shape[1] > LEAST_FREE * count
+        return bool(self._weight(joint).any()) and self._basis(joint).leaves_enough
 
-    def _basis(self, joint: int) -> tuple[Float[np.ndarray, "_rows _n"], float, Float[np.ndarray, "_l _l"]]:
-        """Of the model's columns: a basis, the largest singular value, and the moments of the basis."""
+    def free(self, joint: int) -> float:
+        """How many samples the model leaves: noise's variance is known to a share of about sqrt(2 / free)."""
+        return max(self._count(joint) - self._basis(joint).U.shape[1], 1.0)
+
+    def _basis(self, joint: int) -> "_Basis":
+        """Of the model's columns."""
         if joint not in self._bases:
-            U, s, _ = np.linalg.svd(self.columns(joint), full_matrices=False)
-            U = U[:, s > _RANK * s[0]]
-            self._bases[joint] = U, float(s[0]), self.moments(U)
+            basis = self._of(joint, DETAILS[0])
+            for coarser in DETAILS[1:]:
+                if basis.leaves_enough:
+                    break
+                basis = self._of(joint, coarser)
+            self._bases[joint] = basis
         return self._bases[joint]
+
+    def _of(self, joint: int, detail: float) -> "_Basis":
+        U, s, _ = np.linalg.svd(self.columns(joint, detail=detail), full_matrices=False)
+        U = U[:, s > _RANK * s[0]]
+        count = self._count(joint)
+        enough = count - U.shape[1] > max(LEAST_FREE * count, FEWEST_FREE)
+        return _Basis(detail, U, float(s[0]), self.moments(U), enough)
 
     def moments(self, x: Float[np.ndarray, "_rows _n"]) -> Float[np.ndarray, "_lags _lags"]:
         """`moments` of the recordings, one below the other."""
@@ -118,6 +157,11 @@ class Saturation:
 
     def _weight(self, joint: int) -> Float[np.ndarray, " _rows"]:
         return np.concatenate([t.weights[:, joint] for t in self.traces])
+
+    def _count(self, joint: int) -> float:
+        r"""How many samples tell of a joint: $(\sum w^2)^2 / \sum w^4$, their number where all weigh alike."""
+        squares = self._weight(joint) ** 2
+        return float(np.sum(squares) ** 2 / max(np.sum(squares**2), 1e-300))
 
     @functools.cached_property
     def ripples(self) -> list[list[Float[np.ndarray, "_time _n"]]]:

@@ -25,6 +25,8 @@ BEYOND = 4.0
 """Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""
 _COLOURED = 2.5
 """How much larger than its white part noise in the band may be."""
+_UNSURE = 3.0
+"""Deviations by which the noise's variance may be larger than it was estimated."""
 _SMOOTHED, _PAUSE = 0.1, 0.3
 """Over which such an error is averaged, and a pause that does not end it [s]."""
 _LOWEST, _NEARBY = 5.0, 2.0
@@ -45,6 +47,8 @@ def standing_off(problem: Problem, state: State) -> Finding | None:
     # what stands off now and then passes for noise of a joint; its torque from sample to sample shows less
     white = np.median([white_noise(t.signals.tau) for t in problem.traces if t.signals.tau is not None], 0)
     noise = np.minimum(state.noise.std, np.where(white > 0, _COLOURED * white, np.inf))  # 0: coarse steps
+    free = np.array([problem.saturation.free(j) for j in range(problem.dof)])
+    noise = noise * np.sqrt(1 + _UNSURE * np.sqrt(2 / free))
     weight = np.maximum(np.mean(weights**2, 0), 1e-9)
     beyond = np.mean((left / noise * weights) ** 2, 0) / weight
     joint = int(np.argmax(beyond))
