@@ -266,6 +266,7 @@ def test_a_body_that_is_put_down_is_one_finding():
     assert found[0].confidence > 0.5
 
 
+@pytest.mark.slow
 def test_a_joint_that_never_moved_is_not_judged_and_that_is_said():
     one = record(30, lambda t, q, qd, qdd: np.eye(7)[3] * 5.0 * np.ones((len(t), 1)))
     q = one.q.copy()
@@ -436,6 +437,7 @@ def test_a_roughly_known_arm_raises_no_alarm_and_its_friction_is_named():
     assert [(f.effect, f.joints) for f in result.findings] == [("coulomb_friction", (4,))]
 
 
+@pytest.mark.slow
 def test_a_joint_far_beyond_its_noise_is_unknown_though_nothing_explains_it():
     """A torque sensor that freezes now and then."""
 
@@ -452,6 +454,7 @@ def test_a_joint_far_beyond_its_noise_is_unknown_though_nothing_explains_it():
     assert unknown.joints == (3,)
 
 
+@pytest.mark.slow
 def test_a_model_identified_by_a_poor_motion_raises_no_alarm():
     """Parameters off, forty times what an identification leaves, in six directions that motion hardly shows."""
     arm = Arm.panda()

@@ -225,6 +225,7 @@ def test_a_stiff_joint_deflects_by_its_torque_over_its_stiffness(motion):
     assert np.abs(found - expected).max() < 0.05 * np.abs(expected).max()
 
 
+@pytest.mark.slow
 def test_what_a_simulation_applies_is_what_inverse_dynamics_has(arm, motion, channels):
     """Along a motion, resistance and damping of the step add up to the columns times the coefficients."""
     for effect in shapes(arm):

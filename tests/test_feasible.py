@@ -83,6 +83,7 @@ def test_a_reachable_right_hand_side_is_reached_from_most_starts(reachable):
     np.testing.assert_allclose(np.sum((x @ A.T - b) ** 2, 1), found.objective, atol=1e-20)
 
 
+@pytest.mark.slow
 def test_what_links_of_the_panda_have_is_met_by_nearly_all_starts_each_in_its_own_way():
     """41 coefficients of 70 parameters: the exact solutions are a space of 29 dimensions, boxes allowing."""
     A, _, bounds = published_problem()
@@ -139,6 +140,7 @@ def test_a_user_constraint_binds_where_it_should_and_is_not_violated():
     np.testing.assert_allclose(found.objective, 4.0, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_non_convex_and_conditional_constraints_are_kept(truth):
     A = np.random.default_rng(1).normal(size=(8, 20))
     hull = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
@@ -161,7 +163,7 @@ def test_non_convex_and_conditional_constraints_are_kept(truth):
     assert np.all(np.linalg.norm(com[:, 0], axis=-1) >= 0.03)
 
 
-@pytest.mark.parametrize("radius", [0.03, 0.1])
+@pytest.mark.parametrize("radius", [pytest.param(0.03, marks=pytest.mark.slow), 0.1])
 def test_constraints_that_the_path_cannot_follow_are_met_by_newton(radius):
     """Light links and data far out of reach press centres of mass against cylinders, where they bend most."""
     A = np.random.default_rng(4).normal(size=(18, 20))
@@ -171,6 +173,7 @@ def test_constraints_that_the_path_cannot_follow_are_met_by_newton(radius):
     assert np.mean(met & (found.objective <= 1.01 * found.objective[found.best])) > 0.8
 
 
+@pytest.mark.slow
 def test_most_starts_reach_the_optimum_under_constraints_of_the_users_own():
     """The published coefficients with each centre of mass in a cylinder, some of which bind."""
     constraints = [com_in_cylinder(i, [0, 0, -0.15], [0, 0, 0.15], 0.09) for i in range(7)]
@@ -180,6 +183,7 @@ def test_most_starts_reach_the_optimum_under_constraints_of_the_users_own():
     assert np.mean((found.violation == 0) & (found.objective <= 1.01 * best)) > 0.9
 
 
+@pytest.mark.slow
 def test_what_cannot_be_met_is_reported_as_violated():
     found = solve(np.eye(10)[:1], np.array([5.0]), boxes(1), constraints=[lambda l: l.mass - 11.0], starts=4)
     np.testing.assert_allclose(found.violation, 1.0, atol=1e-3)
@@ -350,6 +354,7 @@ def chunked(reachable):
     )
 
 
+@pytest.mark.slow
 def test_starts_that_leave_when_done_end_where_they_would_have_ended(chunked):
     _, _, (whole, few) = chunked
     # Another number of lanes sums in another order, which long ways magnify.
@@ -381,6 +386,7 @@ def test_a_converged_start_is_as_close_to_the_certified_optimum_as_it_claims():
     np.testing.assert_allclose(found.objective, bound, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_boxes_that_are_points_are_kept():
     mass = np.array([[2.0, 2.0]])
     com = np.array([[[0.0, 0.0], [-0.1, 0.1], [-0.1, 0.1]]])
@@ -392,7 +398,7 @@ def test_boxes_that_are_points_are_kept():
     np.testing.assert_allclose(found.objective, 1.01, rtol=1e-4)
 
 
-@pytest.mark.parametrize("width", [0.0, 0.01, 0.1])
+@pytest.mark.parametrize("width", [0.0, pytest.param(0.01, marks=pytest.mark.slow), 0.1])
 def test_a_box_on_the_inertia_binds_where_it_should(width):
     """min (Ixx - 0.5)² under Ixx <= 0.1 about the centre of mass, which may lie off the origin."""
     box = np.array([[0.0, 0.1], [0, 1.0], [0, 1.0], [-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]])

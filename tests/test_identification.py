@@ -387,6 +387,7 @@ def clarabel_optimum(A: np.ndarray, b: np.ndarray, bounds: Bounds, lower: np.nda
     return float(np.sum((A @ np.array(solution.x) - b) ** 2))
 
 
+@pytest.mark.slow
 def test_one_step_finds_links_that_could_be_built_and_the_convex_optimum(monkeypatch):
     posed = {}
     original = feasible_fit.problem

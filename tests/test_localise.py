@@ -59,6 +59,7 @@ def found_in(problem: Problem):
     return localise(problem, problem.design((), noise), noise)
 
 
+@pytest.mark.slow
 def test_correlated_noise_shows_nothing_and_its_probabilities_are_uniform(posed):
     """As estimated, the noise is too white: a sixth of the probabilities were below 0.05."""
     results = [found_in(with_noise(posed, seed)) for seed in range(6)]

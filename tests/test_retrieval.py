@@ -142,6 +142,7 @@ def test_links_stay_near_the_nominal_ones_in_what_the_coefficients_do_not_tell(q
     assert distance(near.standard) < 0.8 * np.median([distance(phi) for phi in as_good])
 
 
+@pytest.mark.slow
 def test_constraints_that_no_start_meets_are_an_error(quick):
     with pytest.raises(InputError, match="no start of 64"):
         retrieve(table(), constraints=[lambda links: links.mass[:1] - 11.0], **quick)

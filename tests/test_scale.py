@@ -108,7 +108,7 @@ def limit(most: float):
     ("change", "differing"),
     [
         ({"seed": 6}, "seed"),
-        ({"constraints": [limit(3.0)]}, "constraints"),
+        pytest.param({"constraints": [limit(3.0)]}, "constraints", marks=pytest.mark.slow),
         ({"extra_upper": np.array([0.2])}, "further unknowns"),
     ],
 )

@@ -213,6 +213,7 @@ def test_missing_rows_are_missing(resting):
     assert_allclose(log.time[-1], 9.999)
 
 
+@pytest.mark.slow
 def test_one_fault_less_leaves_the_others_as_they_were(resting):
     both = resting(torque_noise=0.05, position_noise=1e-4)
     one = resting(torque_noise=0.05)

@@ -25,8 +25,9 @@ many times the noise's own, in a joint whose residual is at least this share of 
 DOUBT, CROWD = 6.0, 0.6
 """How probability falls with the share that is left in a finding's joints, $e^{-6 s}$, and with every effect
 beyond two in its `crowd`: who needs many laws has not met the right one."""
-MISLEADS = 0.1
-"""And for a law that predicts torque no better where it was not fitted."""
+MISLEADS, WANDERS = 0.1, 0.3
+"""And for a law that predicts torque no better where it was not fitted; a drift, which goes on as it likes, is
+doubted less for that."""
 MEANT, AS_CLEAR = 0.05, 0.1
 """Share of a term's torque from which it counts among the laws of a joint; share of a term's evidence from which
 another's is about as clear."""
@@ -60,7 +61,9 @@ def findings(problem: Problem, state: State, kept: Sequence[Term]) -> list[Findi
                 each[i] = f"{names[i]} {k}"
     doubt = CROWD ** np.maximum(0.0, crowd(where, each, [r[0] for r in rivals]) - 2)
     doubt = doubt * np.exp(-DOUBT * where @ left)
-    doubt = doubt * np.array([1.0 if any(t is k for k in kept) else MISLEADS for t in state.terms])
+    lost = [all(t is not k for k in kept) for t in state.terms]
+    drifts = [hasattr(t.effect, "until") for t in state.terms]
+    doubt = doubt * np.where(lost, np.where(drifts, WANDERS, MISLEADS), 1.0)
     spread = covariances(problem, state)
     out = [_finding(problem, state, group, names[group[0]], rivals, doubt, spread) for group in groups]
     out = unnamed_where_doubtful(problem, state, out)

@@ -56,6 +56,16 @@ def dtype(request):
     return request.param
 
 
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [
+        ("panda", jnp.float64),
+        ("chain of 1", jnp.float64),
+        ("chain of 3", jnp.float64),
+        ("chain of 3", jnp.float32),
+        pytest.param("panda", jnp.float32, marks=pytest.mark.slow),
+    ],
+)
 def test_fast_forms_equal_the_plain_definitions(name, dtype):
     (q, qd, qdd, armature), (tau, Y, M, acceleration) = plain(name)
     chain, phi = arm(name)
@@ -79,7 +89,7 @@ def test_regrouped_bodies_take_the_same_torques(name):
     close(torque(q, qd, qdd), tau, 1e-12)
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (5, 1, 2)])
+@pytest.mark.parametrize("shape", [pytest.param((), marks=pytest.mark.slow), (0,), (5, 1, 2)])
 def test_any_leading_shape_is_that_many_samples(shape):
     (*motion, armature), theirs = plain("chain of 3")
     chain, phi = arm("chain of 3")
@@ -134,7 +144,9 @@ def test_parameters_known_while_tracing_are_folded():
     )
 
 
-@pytest.mark.parametrize("name", ["chain of 3", pytest.param("panda", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["chain of 1", *(pytest.param(name, marks=pytest.mark.slow) for name in ("chain of 3", "panda"))]
+)
 def test_derivatives_of_the_fast_forms_equal_those_of_the_plain_ones(name):
     (q, qd, qdd, armature), _ = plain(name)
     chain, phi = arm(name)
@@ -161,6 +173,7 @@ def test_derivatives_of_the_fast_forms_equal_those_of_the_plain_ones(name):
         close(ours, theirs, 1e-10)
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_there():
     (q, qd, qdd, _), _ = plain("chain of 1")
     chain, phi = arm("chain of 1")

@@ -77,7 +77,7 @@ class Case(NamedTuple):
     pinocchio: Any
 
 
-@pytest.fixture(scope="module", params=ARMS)
+@pytest.fixture(scope="module", params=[*ARMS[:-1], pytest.param(ARMS[-1], marks=pytest.mark.slow)])
 def case(request) -> Case:
     chain, phi = arm(request.param)
     motion = states(ARMS.index(request.param), SAMPLES, chain.dof)
@@ -208,6 +208,7 @@ def test_forward_dynamics_with_armature_equals_mujoco(case):
     assert jnp.abs(qdd - case.motion[2]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_float32_in_gives_float32_out_close_to_float64():
     chain, phi = arm("panda")
     double = (chain, phi, *states(15, SAMPLES, chain.dof), jnp.full(chain.dof, 0.1))
@@ -248,6 +249,7 @@ def test_gradients_are_finite_at_rest_in_every_input(mixed, what, straight, mass
     assert jnp.abs(gradients[3]).max() > 0
 
 
+@pytest.mark.slow
 def test_both_modes_of_differentiation_agree_with_finite_differences(mixed):
     chain, phi = mixed
     q, qd, qdd = (x[0] for x in states(21, 1, 4))
@@ -299,6 +301,7 @@ def test_one_trace_serves_every_arm_of_a_shape():
     assert len(traces) == 1
 
 
+@pytest.mark.slow
 def test_inverse_dynamics_equals_mjx(mixed):
     # its compilation takes seconds a joint; the Panda's is in tests/test_validation.py (slow)
     from mujoco import mjx
