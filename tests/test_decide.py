@@ -64,6 +64,18 @@ def test_a_spring_that_stiffens_is_a_spring_wherever_the_joint_moves():
     assert spring.evidence > max(handicapped(p).evidence for p in free)
 
 
+def test_a_cable_that_is_slack_on_one_side_is_a_spring_that_gets_taut_where_it_does():
+    cable = lambda t, q, qd, qdd: np.eye(7)[5] * (5.0 * np.maximum(q[:, [5]] - 1.9, 0.0))
+    found = diagnose(None, [record(30, cable), record(31, cable)], knowledge="exact")
+    (spring,) = found.findings
+    assert (spring.effect, spring.joints) == ("joint_spring", (5,))
+    number = {p["name"]: p["value"] for p in spring.parameters}
+    assert number["stiffness_above"] == pytest.approx(5.0, rel=0.02)
+    assert number["around"] == pytest.approx(1.9, abs=0.01)
+    assert abs(number["stiffness_below"]) < 0.1
+    assert found.fit.held_out_rmse_after[5] < 1.1 * found.fit.noise_floor[5]
+
+
 def test_a_curve_of_another_joint_s_motion_stands_in_that_joint_s_shadow():
     """What a filter leaves of joint 2's reversals shows in joint 4, as a function of joint 2's velocity."""
     problem = posed(record(3, lambda t, q, qd, qdd: np.tanh(qd / 0.01) * (np.arange(7) == 1)))

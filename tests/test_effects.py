@@ -21,7 +21,7 @@ from jaxpanda.effects import (
     joint_columns,
 )
 from jaxpanda.effects.contact import ExternalContact
-from jaxpanda.effects.drive import Backlash, JointElasticity, TorqueRipple
+from jaxpanda.effects.drive import Backlash, JointElasticity, JointSpring, TorqueRipple
 from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.load import GravityDirection, InertialParameters, Payload, PayloadChange
 from jaxpanda.effects.memory import PreslidingHysteresis
@@ -64,6 +64,7 @@ def shapes(arm: Arm):
     proposed = [
         TorqueRipple(1, 20.0, "one"),
         TorqueRipple(1, 20.0, "two"),
+        JointSpring(3, "slack", -1.5, 0.05),
         PayloadChange(6, 1.0, 1e9, "a.csv", "gained"),
         ExternalContact(4, 1.0, 2.0, "a.csv", "base"),
         ExternalContact(4, 1.0, 2.0, "a.csv", "link"),

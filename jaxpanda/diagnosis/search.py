@@ -725,14 +725,39 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
 
     A pattern search whose every round is one batch.
     """
-    shapes = proposal.effect.shapes
-    if not shapes:
+    arm, shapes = problem.traces[0].motion.arm, proposal.effect.shapes
+    if not shapes and not proposal.effect.variants(arm):
         return proposal
-    effect, steps = proposal.effect, np.array(proposal.steps[: len(shapes)])
+    steps = np.array(proposal.steps[: len(shapes)])
+    effect, best, deviation = _climbed(problem, design, noise, proposal.effect, steps)
+    variants = sorted(effect.variants(arm), key=form_of)
+    for _, alike in itertools.groupby(variants, form_of):
+        together = list(alike)
+        values, deviations = score(problem, design, noise, together)
+        top = int(values.argmax())
+        other = together[top], float(values[top]), deviations[top]
+        if other[0].shapes and not effect.shapes:
+            other = _climbed(problem, design, noise, other[0], np.array(first_steps(other[0])))
+        if other[1] > best:
+            effect, best, deviation = other
+    gained = best - proposal.best
+    return dataclasses.replace(
+        proposal, effect=effect, best=best, deviation=deviation, evidence=proposal.evidence + gained
+    )
+
+
+def _climbed(
+    problem: Problem,
+    design: Design,
+    noise: Noise,
+    effect: AbstractEffect,
+    steps: Float[np.ndarray, " shapes"],
+) -> tuple[AbstractEffect, float, Float[np.ndarray, " n"]]:
+    """The shape near this one with the most evidence, that evidence, and its prior deviations."""
     best, deviation = _single(problem, design, noise, effect)
-    for _ in range(_ROUNDS if len(shapes) == 1 else _ROUNDS + 3):
+    for _ in range(0 if not len(steps) else _ROUNDS if len(steps) == 1 else _ROUNDS + 3):
         moves = [m * e for e in np.diag(steps) for m in (-1.0, 1.0, -0.4, 0.4)]
-        if len(shapes) > 1:
+        if len(steps) > 1:
             moves += [np.array([a, b]) * steps[:2] for a in (-1, 1) for b in (-1, 1)]
         tried = [within(problem, moved(effect, move)) for move in moves]
         values, deviations = score(problem, design, noise, tried)
@@ -744,17 +769,7 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
                 break
         else:
             steps = steps * 0.35
-    variants = sorted(effect.variants(problem.traces[0].motion.arm), key=form_of)
-    for _, alike in itertools.groupby(variants, form_of):
-        together = list(alike)
-        values, deviations = score(problem, design, noise, together)
-        top = int(values.argmax())
-        if values[top] > best:
-            effect, best, deviation = together[top], float(values[top]), deviations[top]
-    gained = best - proposal.best
-    return dataclasses.replace(
-        proposal, effect=effect, best=best, deviation=deviation, evidence=proposal.evidence + gained
-    )
+    return effect, best, deviation
 
 
 def _single(problem: Problem, design: Design, noise: Noise, effect: AbstractEffect):

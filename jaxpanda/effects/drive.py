@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import mass_matrix
@@ -59,7 +60,9 @@ class JointSpring(AbstractInstantEffect):
 
     Form "cubic" adds $k_2 x^2 + k_3 x^3$: a spring that stiffens away from where it rests. There $x = q - $
     `around`, which changes no torque: about zero a joint that moves far from it would need coefficients that
-    cancel, and no prior has those. Form "centred" is without b.
+    cancel, and no prior has those. Form "centred" is without b. Form "slack" pulls on one side of where it gets
+    taut, or harder there than on the other: $\tau_j = k_+ w s(x/w) - k_- w s(-x/w) + b$ with
+    $s(y) = \log(1 + e^y)$ and the width w over which it tightens.
     """
 
     name: ClassVar[str] = "joint_spring"
@@ -69,6 +72,13 @@ class JointSpring(AbstractInstantEffect):
     joint: Joint
     form: str = eqx.field(static=True)
     around: Float[Array, ""] | float = 0.0
+    width: Float[Array, ""] | float = 0.05
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        if self.form != "slack":
+            return ()
+        return Shape("around", "rad", -np.pi, np.pi, False), Shape("width", "rad", 0.01, 0.5)
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["JointSpring"]:
@@ -78,6 +88,13 @@ class JointSpring(AbstractInstantEffect):
             out += [cls(j, "cubic", low + share * (high - low)) for share in _AROUND]
         return out
 
+    def variants(self, arm: Arm) -> Sequence["JointSpring"]:
+        """A spring that is found to stiffen may be slack on one side."""
+        if self.form != "cubic":
+            return []
+        low, high = (float(np.clip(x[self.joint], -np.pi, np.pi)) for x in (arm.lower, arm.upper))
+        return [JointSpring(self.joint, "slack", low + x * (high - low), 0.1) for x in np.linspace(0, 1, 15)]
+
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         k, b = Coefficient("stiffness", "N·m/rad", sign=1), Coefficient("torque_at_zero", "N·m")
@@ -85,6 +102,11 @@ class JointSpring(AbstractInstantEffect):
             "linear": (k, b),
             "centred": (k,),
             "cubic": (k, b, Coefficient("quadratic", "N·m/rad²"), Coefficient("cubic", "N·m/rad³")),
+            "slack": (
+                Coefficient("stiffness_above", "N·m/rad", sign=1),
+                Coefficient("stiffness_below", "N·m/rad", sign=1),
+                Coefficient("torque_when_slack", "N·m"),
+            ),
         }[self.form]
 
     @property
@@ -96,16 +118,21 @@ class JointSpring(AbstractInstantEffect):
                 "centred": "stiffness * q",
                 "cubic": "stiffness * x + torque_at_zero + quadratic * x^2 + cubic * x^3, x = q"
                 f" {-float(self.around):+.4g}",
+                "slack": "width * (stiffness_above * log(1 + exp(x / width)) - stiffness_below * log(1 +"
+                " exp(-x / width))) + torque_when_slack, x = q - around",
             }[self.form]
         )
 
     def at(self, s: Channels) -> Float[Array, " n"]:
         q = s.q[self.joint]
         x, one = q - self.around, jnp.ones_like(q)
+        if self.form == "slack":
+            pulled = [side * self.width * jax.nn.softplus(side * x / self.width) for side in (1.0, -1.0)]
+            return jnp.stack([*pulled, one])
         return jnp.stack({"linear": [q, one], "centred": [q], "cubic": [x, one, x**2, x**3]}[self.form])
 
     def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
-        if self.form == "cubic" or arm.stiffness[int(self.joint)] != 0:
+        if self.form in ("cubic", "slack") or arm.stiffness[int(self.joint)] != 0:
             return {}
         j = int(self.joint)
         return {"stiffness": {j: c[0]}, "springref": {j: -c[1] / c[0] if self.form == "linear" else 0.0}}

@@ -24,12 +24,14 @@ class PreslidingHysteresis(AbstractMemoryEffect):
     r"""Friction that builds up over a distance after each reversal, whatever the speed.
 
     Dahl's form, $\tau_j = F_c z$ with $dz = (\mathrm{sign}(\dot q) - z)\,|\dot q|\,dt / x_s$, and the Jenkins
-    element of Maxwell-slip models, $dz = \dot q\,dt / x_s$ with $|z| \le 1$. Form "... extra" has
+    element of Maxwell-slip models, $dz = \dot q\,dt / x_s$ with $|z| \le 1$. LuGre's form adds to Dahl's what
+    the bristles' own rate damps, $\sigma_1 x_s \dot z = \sigma_1 (\dot q - z |\dot q|)$. Form "... extra" has
     $z - \tanh(\dot q / v_0)$, for a joint whose model holds Coulomb friction at its full level already;
     "... whole" has both levels free.
 
     References:
-        Dahl 1968; Al-Bender, Lampaert, Swevers, IEEE TAC 2005.
+        Dahl 1968; Canudas de Wit, Olsson, Åström, Lischinsky, IEEE TAC 1995, eqs. 1 to 3; Al-Bender, Lampaert,
+        Swevers, IEEE TAC 2005.
     """
 
     name: ClassVar[str] = "presliding_hysteresis"
@@ -50,24 +52,30 @@ class PreslidingHysteresis(AbstractMemoryEffect):
     def grid(cls, arm: Arm) -> Sequence["PreslidingHysteresis"]:
         distances = (1e-3, 2.5e-3, 6e-3, 0.015, 0.035, 0.08)
         forms = [f"{law} {extent}" for law in ("dahl", "jenkins") for extent in ("only", "extra", "whole")]
+        forms.append("lugre only")
         return [cls(j, x, form) for form in forms for x in distances for j in range(arm.dof)]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         level = Coefficient("friction_level", "N·m", sign=1)
-        return (level, Coefficient("coulomb", "N·m")) if self.form.endswith("whole") else (level,)
+        if self._law == "lugre":
+            return level, Coefficient("micro_damping", "N·m·s/rad", sign=1)
+        return (level, Coefficient("coulomb", "N·m")) if self._extent == "whole" else (level,)
 
     @property
     def equation(self) -> str:
         law = {
             "dahl": "dz = (sign(dq) - z) * |dq| * dt / breakaway_distance",
             "jenkins": "dz = dq * dt / breakaway_distance, |z| <= 1",
-        }[self.form.split()[0]]
+            "lugre": "dz = (sign(dq) - z) * |dq| * dt / breakaway_distance",
+        }[self._law]
         torque = {
             "only": "friction_level * z",
             "extra": "friction_level * (z - sign(dq))",
             "whole": "friction_level * z + coulomb * sign(dq)",
-        }[self.form.split()[1]]
+        }[self._extent]
+        if self._law == "lugre":
+            torque += " + micro_damping * (dq - z * |dq|)"
         return f"tau = {torque}, {law}"
 
     def start(self, s: Channels) -> Float[Array, " states"]:
@@ -78,13 +86,19 @@ class PreslidingHysteresis(AbstractMemoryEffect):
     ) -> tuple[Float[Array, " states"], Float[Array, " n"]]:
         qd = s.qd[self.joint]
         moved = qd * dt / self.breakaway_distance
-        if self.form.startswith("dahl"):
+        if self._law == "jenkins":
+            z = jnp.clip(z + moved, -1.0, 1.0)
+        else:
             sign = jnp.sign(qd)
             z = sign + (z - sign) * jnp.exp(-jnp.abs(moved))
-        else:
-            z = jnp.clip(z + moved, -1.0, 1.0)
+        if self._law == "lugre":
+            return z, jnp.concatenate([z, qd - z * jnp.abs(qd)])
         sign = smooth_sign(qd, _WIDTH)[None]
         return z, {"only": z, "extra": z - sign, "whole": jnp.concatenate([z, sign])}[self._extent]
+
+    @property
+    def _law(self) -> str:
+        return self.form.split()[0]
 
     @property
     def _extent(self) -> str:
@@ -98,6 +112,8 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         z = self.step(z, s, dt)[0]
         level = {"only": jnp.zeros_like(c[0]), "extra": -c[0], "whole": c[-1]}[self._extent]
         damping = level * sign_over_velocity(s.qd[self.joint], _WIDTH)
+        if self._law == "lugre":
+            damping = c[1] * (1 - z[0] * jnp.sign(s.qd[self.joint]))
         return Resistance(self._here(c[0] * z[0], s), self._here(damping, s), z)
 
 
