@@ -64,6 +64,7 @@ def test_a_spring_that_stiffens_is_a_spring_wherever_the_joint_moves():
     assert spring.evidence > max(handicapped(p).evidence for p in free)
 
 
+@pytest.mark.slow
 def test_a_cable_that_is_slack_on_one_side_is_a_spring_that_gets_taut_where_it_does():
     cable = lambda t, q, qd, qdd: np.eye(7)[5] * (5.0 * np.maximum(q[:, [5]] - 1.9, 0.0))
     found = diagnose(None, [record(30, cable), record(31, cable)], knowledge="exact")
@@ -74,6 +75,19 @@ def test_a_cable_that_is_slack_on_one_side_is_a_spring_that_gets_taut_where_it_d
     assert number["around"] == pytest.approx(1.9, abs=0.01)
     assert abs(number["stiffness_below"]) < 0.1
     assert found.fit.held_out_rmse_after[5] < 1.1 * found.fit.noise_floor[5]
+
+
+@pytest.mark.slow
+def test_a_ripple_of_which_little_is_seen_is_no_spring_with_a_ripple_on_it():
+    """Three quarters of a period, told by the second harmonic."""
+    q0 = record(30).q.mean(0)[3]
+
+    def ripple(t, q, qd, qdd):
+        angle = 0.75 * 2 * np.pi / np.ptp(q[:, [3]]) * (q[:, [3]] - q0)
+        return np.eye(7)[3] * (np.sin(angle) + 0.45 * np.sin(2 * angle + 0.5))
+
+    found = diagnose(None, [record(30, ripple)], knowledge="exact")
+    assert [(f.effect, f.joints) for f in found.findings] == [("torque_ripple", (3,))]
 
 
 def test_a_curve_of_another_joint_s_motion_stands_in_that_joint_s_shadow():
@@ -98,6 +112,7 @@ def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_doubted():
     assert doubtful.confidence == pytest.approx(MISLEADS * sure.confidence, rel=0.01)
 
 
+@pytest.mark.slow
 def test_what_each_recording_shows_otherwise_is_not_explained():
     """The same curve of position with the other sign a day later is no physics of the arm."""
     day = lambda sign: lambda t, q, qd, qdd: sign * 0.3 * np.sin(2 * q[:, [4]]) * np.eye(7)[4]

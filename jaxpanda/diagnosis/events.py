@@ -19,6 +19,8 @@ BIN = 0.1
 """Resolution of the scan over time [s]."""
 _WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135)
 _EDGE = 3
+_SLOWEST = 5.0
+"""Least order of a ripple [1/rad]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,20 +41,26 @@ class Proposal:
         return self.effect.name, self.effect.joints
 
 
+def slowest(problem: Problem, joint: int) -> tuple[float, float]:
+    """The least orders of a joint that show one period and a half, lest it be a spring: of the second harmonic,
+    of the first [1/rad]."""
+    travel = max(float(np.ptp(t.motion.q[:, joint])) for t in problem.traces)
+    first = 3 * np.pi / max(travel, 1e-3)
+    return max(_SLOWEST, 0.5 * first), max(_SLOWEST, first)
+
+
 def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]) -> list[Proposal]:
     """For each of these joints that turns far enough the likeliest order."""
 
     def one(j: int) -> Proposal | None:
         q = [t.motion.q[:, j] for t in problem.traces]
-        travel = max(np.ptp(x) for x in q)
+        travel, (_, lowest) = max(np.ptp(x) for x in q), slowest(problem, j)
         speed = np.sqrt(np.mean(np.concatenate([t.motion.qd[:, j] for t in problem.traces]) ** 2))
         if travel < 0.1 or speed < 0.02:
             return None
         step = np.pi / (2 * travel)
         highest = min(400.0, 2 * np.pi * 0.9 * problem.traces[0].cutoff / speed)
-        orders = np.arange(
-            max(5.0, 3 * np.pi / travel), highest, step
-        )  # one turn and a half, lest it be a spring
+        orders = np.arange(lowest, highest, step)
         if not len(orders):
             return None
         b, G = problem.projected(

@@ -11,12 +11,12 @@ from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
-from ..effects.drive import Backlash, JointElasticity
+from ..effects.drive import Backlash, JointElasticity, TorqueRipple
 from ..effects.effect import AbstractDryFriction
 from ..effects.friction import AsymmetricFriction
 from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
 from ..effects.unknown import Unknown
-from .events import BIN, Proposal, ripple, windows
+from .events import BIN, Proposal, ripple, slowest, windows
 from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
 from .host import parallel
 from .library import Candidates, form_of
@@ -382,7 +382,8 @@ def is_undetermined(state: State, i: int) -> bool:
 
 
 def contest(problem: Problem, state: State, say: Any) -> State:
-    """At joints that took two named terms and more, see if one free form does better than all of them."""
+    """At joints that took two named terms and more, see if one free form does better than all of them; or, where
+    one of them is a ripple, a ripple of lower order."""
     for joint in range(problem.dof):
         here = [t for t in state.terms if t.effect.joints == (joint,) and t.effect.name != "unknown"]
         if len(here) < 2:
@@ -391,11 +392,27 @@ def contest(problem: Problem, state: State, say: Any) -> State:
         design = problem.design(others, state.noise)
         gained = state.design.log_evidence - design.log_evidence
         at_joint = [c for c in problem.catchalls if c.joint == joint]
-        best = max((*grids(problem, design, state.noise, at_joint),), key=lambda p: p.best)
+        forms = grids(problem, design, state.noise, at_joint)
+        if any(isinstance(t.effect, TorqueRipple) for t in here):
+            forms += slow_ripple(problem, design, state.noise, joint)
+        best = max(forms, key=lambda p: p.best)
         say(f"joint {joint + 1}: {len(here)} terms {gained:.1f}, {best.best:.1f}: {best.effect.equation}")
         if best.best > gained:
             state = with_terms(problem, (*others, problem.term(best.effect, best.deviation)))
     return state
+
+
+def slow_ripple(problem: Problem, design: Design, noise: Noise, joint: int) -> list[Proposal]:
+    """The likeliest ripple of which the joint shows too few periods for `ripple`, told by its second harmonic."""
+    first, last = slowest(problem, joint)
+    if first >= last:
+        return []
+    effects = [TorqueRipple(joint, float(n), "two") for n in np.geomspace(first, last, _TRIED)]
+    values, deviations = score(problem, design, noise, effects)
+    top = int(values.argmax())
+    value = float(values[top])
+    proposal = Proposal(effects[top], value, value, deviations[top], first_steps(effects[top]))
+    return [refine(problem, design, noise, proposal)]
 
 
 def swap(problem: Problem, state: State, say: Any) -> State:
