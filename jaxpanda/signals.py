@@ -376,7 +376,7 @@ def _kept(
     if len(keep) < 2:
         raise InputError(
             f"{recording.name}: {time[-1] - time[0]:.3g} s are too short, for {trim:g} s are left out at "
-            "both ends and around gaps: record longer, or lower trim or raise cutoff"
+            "both ends and around gaps: record longer (a higher cutoff leaves out less)"
         )
     return keep
 
