@@ -44,10 +44,10 @@ UNLIKELY = 0.1
 """Confidence below which one of several findings loses its name."""
 
 
-def findings(problem: Problem, state: State, kept: Sequence[Term]) -> list[Finding]:
+def findings(problem: Problem, state: State, lost: Sequence[bool]) -> list[Finding]:
     """The accepted terms as findings, those that explain most first.
 
-    `kept`: the terms that predict torque where they were not fitted.
+    `lost`: which of them predict torque no better where they were not fitted.
     """
     rivals = [_rivals(problem, state, i) for i in range(len(state.terms))]
     groups = together(problem, state.terms)
@@ -61,7 +61,6 @@ def findings(problem: Problem, state: State, kept: Sequence[Term]) -> list[Findi
                 each[i] = f"{names[i]} {k}"
     doubt = CROWD ** np.maximum(0.0, crowd(where, each, [r[0] for r in rivals]) - 2)
     doubt = doubt * np.exp(-DOUBT * where @ left)
-    lost = [all(t is not k for k in kept) for t in state.terms]
     drifts = [hasattr(t.effect, "until") for t in state.terms]
     doubt = doubt * np.where(lost, np.where(drifts, WANDERS, MISLEADS), 1.0)
     spread = covariances(problem, state)

@@ -206,14 +206,15 @@ def diagnose(
             break
         state = polished(problem, other)
     kept = transferable(problem, state)
-    found = tuple(findings(problem, state, kept.terms))
+    lost = [all(t is not k for k in kept.terms) for t in state.terms]
+    found = tuple(findings(problem, state, lost))
     corrected = _corrected(arm, premises, kept)
-    dropped = [t.effect.name.replace("_", " ") for t in state.terms if all(t is not k for k in kept.terms)]
-    if dropped:
+    if any(lost):
+        dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
         premises = dataclasses.replace(
             premises,
             notes=(*premises.notes, "left out of the corrected model, as torque is predicted no better with it"
-                   f" where it was not fitted: {', '.join(sorted(set(dropped)))}"),
+                   f" where it was not fitted: {', '.join(sorted(dropped))}"),
         )  # fmt: skip
     text, warnings = _corrected_xml(source, corrected)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]

@@ -41,12 +41,9 @@ class Proposal:
         return self.effect.name, self.effect.joints
 
 
-def slowest(problem: Problem, joint: int) -> tuple[float, float]:
-    """The least orders of a joint that show one period and a half, lest it be a spring: of the second harmonic,
-    of the first [1/rad]."""
-    travel = max(float(np.ptp(t.motion.q[:, joint])) for t in problem.traces)
-    first = 3 * np.pi / max(travel, 1e-3)
-    return max(_SLOWEST, 0.5 * first), max(_SLOWEST, first)
+def slowest(travel: float) -> float:
+    """The least order of which a travel [rad] shows a period and a half, lest it be a spring [1/rad]."""
+    return max(_SLOWEST, 3 * np.pi / travel)
 
 
 def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]) -> list[Proposal]:
@@ -54,13 +51,13 @@ def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]
 
     def one(j: int) -> Proposal | None:
         q = [t.motion.q[:, j] for t in problem.traces]
-        travel, (_, lowest) = max(np.ptp(x) for x in q), slowest(problem, j)
+        travel = max(np.ptp(x) for x in q)
         speed = np.sqrt(np.mean(np.concatenate([t.motion.qd[:, j] for t in problem.traces]) ** 2))
         if travel < 0.1 or speed < 0.02:
             return None
         step = np.pi / (2 * travel)
         highest = min(400.0, 2 * np.pi * 0.9 * problem.traces[0].cutoff / speed)
-        orders = np.arange(lowest, highest, step)
+        orders = np.arange(slowest(travel), highest, step)
         if not len(orders):
             return None
         b, G = problem.projected(

@@ -45,7 +45,17 @@ class _Basis:
     """Singular value."""
     taken: Float[np.ndarray, "lags lags"]
     """What the model takes of the moments of white noise of unit variance."""
-    leaves_enough: bool
+    count: float
+    """How many samples tell."""
+
+    @property
+    def free(self) -> float:
+        """How many of them the model leaves."""
+        return self.count - self.U.shape[1]
+
+    @property
+    def tells(self) -> bool:
+        return self.free > max(LEAST_FREE * self.count, FEWEST_FREE)
 
 
 class Saturation:
@@ -116,25 +126,26 @@ class Saturation:
         $\sigma^2 \sum_t U_{t-k} \cdot U_{t-l}$ of the moment of lags k and l: most where it is slow.
         """
         r, bases = self.left(joint, extra)
-        taken = sum((self.moments(V) for V in bases[1:]), self._basis(joint).taken)
-        count, used = self._count(joint), sum(U.shape[1] for U in bases)
+        basis = self._basis(joint)
+        taken = sum((self.moments(V) for V in bases[1:]), basis.taken)
+        count, used = basis.count, sum(U.shape[1] for U in bases)
         variance = float(r @ r) / max(count - used, LEAST_FREE * count)
         return autoregression(self.moments(r[:, None]) + variance * taken, count)
 
     def tells(self, joint: int) -> bool:
         """Whether the recordings are long enough for the model to leave noise of a joint to be seen."""
-        return bool(self._weight(joint).any()) and self._basis(joint).leaves_enough
+        return self._basis(joint).tells
 
     def free(self, joint: int) -> float:
         """How many samples the model leaves: noise's variance is known to a share of about sqrt(2 / free)."""
-        return max(self._count(joint) - self._basis(joint).U.shape[1], 1.0)
+        return max(self._basis(joint).free, 1.0)
 
     def _basis(self, joint: int) -> "_Basis":
         """Of the model's columns."""
         if joint not in self._bases:
             basis = self._of(joint, DETAILS[0])
             for coarser in DETAILS[1:]:
-                if basis.leaves_enough:
+                if basis.tells:
                     break
                 basis = self._of(joint, coarser)
             self._bases[joint] = basis
@@ -143,9 +154,7 @@ class Saturation:
     def _of(self, joint: int, detail: float) -> "_Basis":
         U, s, _ = np.linalg.svd(self.columns(joint, detail=detail), full_matrices=False)
         U = U[:, s > _RANK * s[0]]
-        count = self._count(joint)
-        enough = count - U.shape[1] > max(LEAST_FREE * count, FEWEST_FREE)
-        return _Basis(detail, U, float(s[0]), self.moments(U), enough)
+        return _Basis(detail, U, float(s[0]), self.moments(U), self._count(joint))
 
     def moments(self, x: Float[np.ndarray, "_rows _n"]) -> Float[np.ndarray, "_lags _lags"]:
         """`moments` of the recordings, one below the other."""

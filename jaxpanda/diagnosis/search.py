@@ -404,15 +404,15 @@ def contest(problem: Problem, state: State, say: Any) -> State:
 
 def slow_ripple(problem: Problem, design: Design, noise: Noise, joint: int) -> list[Proposal]:
     """The likeliest ripple of which the joint shows too few periods for `ripple`, told by its second harmonic."""
-    first, last = slowest(problem, joint)
+    travel = max(float(np.ptp(t.motion.q[:, joint])) for t in problem.traces)
+    first, last = slowest(2 * travel), slowest(travel)
     if first >= last:
         return []
     effects = [TorqueRipple(joint, float(n), "two") for n in np.geomspace(first, last, _TRIED)]
-    values, deviations = score(problem, design, noise, effects)
-    top = int(values.argmax())
-    value = float(values[top])
-    proposal = Proposal(effects[top], value, value, deviations[top], first_steps(effects[top]))
-    return [refine(problem, design, noise, proposal)]
+    effect, _, _ = _likeliest(problem, design, noise, effects)
+    steps = first_steps(effect)
+    effect, best, deviation = _climbed(problem, design, noise, effect, steps)
+    return [Proposal(effect, best, best, deviation, steps)]
 
 
 def swap(problem: Problem, state: State, say: Any) -> State:
@@ -745,16 +745,13 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
     arm, shapes = problem.traces[0].motion.arm, proposal.effect.shapes
     if not shapes and not proposal.effect.variants(arm):
         return proposal
-    steps = np.array(proposal.steps[: len(shapes)])
+    steps = proposal.steps[: len(shapes)]
     effect, best, deviation = _climbed(problem, design, noise, proposal.effect, steps)
     variants = sorted(effect.variants(arm), key=form_of)
     for _, alike in itertools.groupby(variants, form_of):
-        together = list(alike)
-        values, deviations = score(problem, design, noise, together)
-        top = int(values.argmax())
-        other = together[top], float(values[top]), deviations[top]
+        other = _likeliest(problem, design, noise, list(alike))
         if other[0].shapes and not effect.shapes:
-            other = _climbed(problem, design, noise, other[0], np.array(first_steps(other[0])))
+            other = _climbed(problem, design, noise, other[0], first_steps(other[0]))
         if other[1] > best:
             effect, best, deviation = other
     gained = best - proposal.best
@@ -763,35 +760,42 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
     )
 
 
+Shaped = tuple[AbstractEffect, float, Float[np.ndarray, " n"]]
+"""An effect, its evidence, and the prior deviations of its coefficients."""
+
+
 def _climbed(
-    problem: Problem,
-    design: Design,
-    noise: Noise,
-    effect: AbstractEffect,
-    steps: Float[np.ndarray, " shapes"],
-) -> tuple[AbstractEffect, float, Float[np.ndarray, " n"]]:
-    """The shape near this one with the most evidence, that evidence, and its prior deviations."""
+    problem: Problem, design: Design, noise: Noise, effect: AbstractEffect, steps: Sequence[float]
+) -> Shaped:
+    """The shape near this one with the most evidence."""
     best, deviation = _single(problem, design, noise, effect)
-    for _ in range(0 if not len(steps) else _ROUNDS if len(steps) == 1 else _ROUNDS + 3):
-        moves = [m * e for e in np.diag(steps) for m in (-1.0, 1.0, -0.4, 0.4)]
+    if not steps:
+        return effect, best, deviation
+    scale = np.array(steps)
+    for _ in range(_ROUNDS if len(steps) == 1 else _ROUNDS + 3):
+        moves = [m * e for e in np.diag(scale) for m in (-1.0, 1.0, -0.4, 0.4)]
         if len(steps) > 1:
-            moves += [np.array([a, b]) * steps[:2] for a in (-1, 1) for b in (-1, 1)]
-        tried = [within(problem, moved(effect, move)) for move in moves]
-        values, deviations = score(problem, design, noise, tried)
-        top = int(values.argmax())
-        if values[top] > best:
-            gained = values[top] - best
-            effect, best, deviation = tried[top], float(values[top]), deviations[top]
+            moves += [np.array([a, b]) * scale[:2] for a in (-1, 1) for b in (-1, 1)]
+        tried = _likeliest(problem, design, noise, [within(problem, moved(effect, move)) for move in moves])
+        if tried[1] > best:
+            gained = tried[1] - best
+            effect, best, deviation = tried
             if gained < 0.05:
                 break
         else:
-            steps = steps * 0.35
+            scale = scale * 0.35
     return effect, best, deviation
 
 
+def _likeliest(problem: Problem, design: Design, noise: Noise, effects: Sequence[AbstractEffect]) -> Shaped:
+    """Of single shapes of one form at one place."""
+    values, deviations = score(problem, design, noise, effects)
+    top = int(values.argmax())
+    return effects[top], float(values[top]), deviations[top]
+
+
 def _single(problem: Problem, design: Design, noise: Noise, effect: AbstractEffect):
-    values, deviations = score(problem, design, noise, [effect])
-    return float(values[0]), deviations[0]
+    return _likeliest(problem, design, noise, [effect])[1:]
 
 
 def within(problem: Problem, effect: AbstractEffect) -> AbstractEffect:

@@ -64,11 +64,9 @@ class PreslidingHysteresis(AbstractMemoryEffect):
 
     @property
     def equation(self) -> str:
-        law = {
-            "dahl": "dz = (sign(dq) - z) * |dq| * dt / breakaway_distance",
-            "jenkins": "dz = dq * dt / breakaway_distance, |z| <= 1",
-            "lugre": "dz = (sign(dq) - z) * |dq| * dt / breakaway_distance",
-        }[self._law]
+        law = "dz = (sign(dq) - z) * |dq| * dt / breakaway_distance"
+        if self._law == "jenkins":
+            law = "dz = dq * dt / breakaway_distance, |z| <= 1"
         torque = {
             "only": "friction_level * z",
             "extra": "friction_level * (z - sign(dq))",
@@ -110,10 +108,11 @@ class PreslidingHysteresis(AbstractMemoryEffect):
 
     def resist(self, c, arm, z, s, dt):
         z = self.step(z, s, dt)[0]
-        level = {"only": jnp.zeros_like(c[0]), "extra": -c[0], "whole": c[-1]}[self._extent]
-        damping = level * sign_over_velocity(s.qd[self.joint], _WIDTH)
         if self._law == "lugre":
             damping = c[1] * (1 - z[0] * jnp.sign(s.qd[self.joint]))
+        else:
+            level = {"only": jnp.zeros_like(c[0]), "extra": -c[0], "whole": c[-1]}[self._extent]
+            damping = level * sign_over_velocity(s.qd[self.joint], _WIDTH)
         return Resistance(self._here(c[0] * z[0], s), self._here(damping, s), z)
 
 

@@ -63,6 +63,7 @@ def dtype(request):
         ("chain of 1", jnp.float64),
         ("chain of 3", jnp.float64),
         ("chain of 3", jnp.float32),
+        ("chain of 1", jnp.float32),
         pytest.param("panda", jnp.float32, marks=pytest.mark.slow),
     ],
 )
