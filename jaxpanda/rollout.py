@@ -51,6 +51,7 @@ from .validation import (
     has_run_away,
     jit_mjx,
     mjx_package,
+    own_log,
 )
 
 CUTOFF = 20.0
@@ -390,6 +391,7 @@ def _in_mjx(bare: mujoco.MjModel, plant: Plant, gains: Gains, task: Task) -> tup
     return tuple(np.asarray(x) for x in jitted(numbers))
 
 
+@own_log()
 def _in_mujoco(bare: mujoco.MjModel, plant: Plant, gains: Gains, task: Task) -> tuple[np.ndarray, ...]:
     """C MuJoCo, step by step."""
     model, dt = copy.copy(bare), float(bare.opt.timestep)

@@ -17,7 +17,7 @@ import contextlib
 import copy
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -519,6 +519,21 @@ def has_run_away(data: mujoco.MjData) -> bool:
     return any(data.warning[int(one)].number for one in bad)
 
 
+@contextlib.contextmanager
+def own_log() -> Iterator[None]:
+    """MuJoCo's warnings while it steps; it would write them to a file in the folder that it was called from.
+
+    `has_run_away` sees what they say.
+    """
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+@own_log()
 def _rollout_mujoco(bare: mujoco.MjModel, tasks: Sequence[_Task], law: _Feedback) -> Rollout | None:
     """The model under the recorded torque in C MuJoCo."""
     start = time.perf_counter()

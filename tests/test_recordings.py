@@ -277,6 +277,46 @@ def test_a_motion_has_no_torque_to_identify_from():
         Recording("motion", made.time, made.q).require_tau()
 
 
+@pytest.mark.parametrize(
+    ("column", "rows", "value"), [("tau_2", [120], 1e6), ("q_1", [0], 30.0), ("tau_3", [50, 51, 799], -4e3)]
+)
+def test_readings_that_stand_alone_are_left_out_and_told(tmp_path, column, rows, value):
+    clean, path = recording(800), tmp_path / "glitch.csv"
+    cells = [line.split(",") for line in _saved(clean, tmp_path).splitlines()]
+    for row in rows:
+        cells[row + 1][cells[0].index(column)] = repr(value)
+    path.write_text(text(cells))
+    read = load(path)
+    kept = np.setdiff1d(np.arange(clean.samples), rows)
+    assert np.array_equal(read.tau, clean.tau[kept])
+    assert np.array_equal(read.q, clean.q[kept])
+    assert list(read.repairs.values()) == [len(rows)]
+    assert f"column {column} reads {value:g} at {clean.time[rows[0]]:g} s" in read.notes[0]
+
+
+@pytest.mark.parametrize("shape", ["an impact", "a switch of sign", "an encoder's last digit", "tails"])
+def test_what_an_arm_may_do_is_no_reading_that_stands_alone(tmp_path, shape):
+    made, rng = recording(2000, rate=1000.0), np.random.default_rng(1)
+    if shape == "an impact":  # 4 ms long, 40 N m
+        made.tau[700:704, 0] += 40 * np.sin(np.pi * np.arange(1, 5) / 5)
+    elif shape == "a switch of sign":
+        made.tau[:, 0] = np.sign(made.tau[:, 0])
+        made.tau[np.flatnonzero(np.diff(made.tau[:, 0]))[0] + 2, 0] *= -1
+    elif shape == "an encoder's last digit":
+        made.q[:, 1] = 0.7 + 1e-5 * (rng.random(2000) < 0.002)
+    else:
+        made.tau[:] += 0.1 * rng.standard_t(2.5, size=made.tau.shape)
+    _saved(made, tmp_path)
+    read = load(tmp_path / "made.csv")
+    assert not read.repairs
+    assert read.samples == made.samples
+
+
+def _saved(made: Recording, folder) -> str:
+    save(made, folder / "made.csv")
+    return (folder / "made.csv").read_text()
+
+
 def host_log(folder, flat: bool, **extra: str):
     """What a host writes that reads a 1 kHz controller too often here, too late there; returns true ticks."""
     key = np.random.default_rng(3)

@@ -76,6 +76,15 @@ def moved() -> Recording:
     )
 
 
+def test_a_simulation_that_runs_away_leaves_nothing_where_it_was_called(moved, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    wild = dataclasses.replace(moved, tau=moved.tau + 1e9)
+    arm, source = two_links()
+    with pytest.raises(InputError, match="ran away"):
+        rollout.replay(corrected(arm), wild, model=source)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_forward_dynamics_undoes_inverse_dynamics_for_every_law():
     arm = every_kind(two_links(0.3)[0])

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..errors import InputError
+from .glitches import without_glitches
 from .recording import Recording
 
 RATES = (50.0, 4000.0)
@@ -16,7 +17,8 @@ _TURN = 2 * np.pi
 
 
 def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Recording:
-    """The same recording, once its numbers are finite, ordered, long enough and in SI units.
+    """The same recording, once its numbers are finite, ordered, long enough and in SI units; of readings that
+    stand alone (`glitches`) the rows are left out, and that is told.
 
     Args:
         recording: as read.
@@ -29,6 +31,7 @@ def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Re
     _finite(recording, row)
     _ordered(recording, row)
     _rate(recording)
+    recording = without_glitches(recording)
     _long_enough(recording)
     _radians(recording)
     _velocity_unit(recording)

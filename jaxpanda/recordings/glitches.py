@@ -1,0 +1,83 @@
+"""Readings that stand alone (a bit that flipped, a sensor's word for "no value"): no arm has moved so or felt it."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .recording import Recording
+
+LEFT_OUT = "rows left out, as a reading in them stands alone"
+"""What the account of repairs says."""
+_LONGEST = 3
+"""Rows that such a reading lasts, at most."""
+_BEYOND = 0.5
+"""How far beyond all the others it lies, in their spread."""
+_JUMP, _USUAL = 50.0, 0.95
+"""How many times larger the steps to it and from it are than such a share of those from row to row, and than the
+smallest, which is what a column is written in."""
+_BACK = 0.1
+"""How far apart the readings before and after it may lie, in its own distance."""
+_FEW = 0.01
+"""Share of the rows beyond which it is the sensor that is so."""
+
+
+def without_glitches(recording: Recording) -> Recording:
+    """The recording without the rows in which a position or a torque stands alone; counted, and the first named.
+
+    One row of a torque that is 1e6 N m for a millisecond would else decide how noisy its joint is, and where a
+    simulation under that torque goes.
+    """
+    channels = {"q": recording.q} | ({} if recording.tau is None else {"tau": recording.tau})
+    found = {
+        f"{name}_{j + 1}": alone
+        for name, channel in channels.items()
+        for j in range(channel.shape[1])
+        if (alone := _alone(channel[:, j])).any()
+    }
+    bad = np.any([*found.values()], axis=0) if found else np.zeros(recording.samples, bool)
+    if not bad.any() or bad.mean() > _FEW:
+        return recording
+    column, alone = next(iter(found.items()))
+    i = int(np.argmax(alone))
+    value = channels[column.split("_")[0]][i, int(column.split("_")[1]) - 1]
+    keep = ~bad
+    return dataclasses.replace(
+        recording,
+        time=recording.time[keep],
+        q=recording.q[keep],
+        qd=None if recording.qd is None else recording.qd[keep],
+        tau=None if recording.tau is None else recording.tau[keep],
+        repairs={**recording.repairs, LEFT_OUT: int(bad.sum())},
+        notes=(
+            *recording.notes,
+            f"{recording.name}: column {column} reads {value:g} at {recording.time[i]:g} s, far from all other"
+            f" readings and from those beside it{_and_others(found)}; such rows are left out",
+        ),
+    )
+
+
+def _and_others(found: dict[str, Bool[np.ndarray, " time"]]) -> str:
+    more = {name: int(np.sum(np.diff(alone, prepend=False) & alone)) for name, alone in found.items()}
+    said = ", ".join(f"{name} {count} times" if count > 1 else name for name, count in more.items())
+    return f" (in all: {said})" if sum(more.values()) > 1 else ""
+
+
+def _alone(x: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
+    """Where a reading lies beyond all the others, and comes and goes within a few rows."""
+    out = np.zeros(len(x), bool)
+    low, high = np.quantile(x, [0.005, 0.995])
+    reach = _BEYOND * (high - low)
+    edges = np.flatnonzero(np.diff(np.r_[False, (x < low - reach) | (x > high + reach), False]))
+    if not edges.size:
+        return out
+    steps = np.abs(np.diff(x))
+    jump = _JUMP * max(np.quantile(steps, _USUAL), np.min(steps[steps > 0], initial=np.inf))
+    for first, last in edges.reshape(-1, 2):
+        if last - first > _LONGEST:
+            continue
+        after = x[last] if last < len(x) else x[first - 1]
+        before = x[first - 1] if first else after
+        there = np.abs(x[first:last] - (before + after) / 2).min()
+        out[first:last] = there > jump and abs(after - before) < _BACK * there
+    return out
