@@ -1,4 +1,4 @@
-"""Readings that stand alone (a bit that flipped, a sensor's word for "no value"): no arm has moved so or felt it."""
+"""Readings that stand alone, as where a bit flipped or a sensor says "no value": no arm has moved or felt so."""
 
 import dataclasses
 
