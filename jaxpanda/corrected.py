@@ -18,6 +18,7 @@ from .effects import (
     AbstractJointEffect,
     Channels,
     Motion,
+    Stretches,
     joint_columns,
     sign_over_velocity,
     smooth_torque,
@@ -182,7 +183,7 @@ class Corrected(eqx.Module):
                 if effect is None or effect.takes_shown != last:
                     continue
                 if isinstance(effect, AbstractJointEffect):
-                    columns = joint_columns([effect], channels, motion.dt)[:, 0]
+                    columns = joint_columns([effect], Stretches(channels), motion.dt)[:, 0]
                     tau[:, effect.joints[0]] += columns @ np.asarray(c)
                 else:
                     tau = tau + effect.over(motion) @ np.asarray(c)  # pyright: ignore

@@ -32,12 +32,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import scipy.interpolate
-from jaxpanda_kernels import gravity_torque, mass_matrix
 from jaxtyping import Array, Float
 
 from . import files
 from .arm import Arm
 from .corrected import FILE, SCHEMA, XML, Corrected, Plant
+from .effects import masses, slopes
 from .errors import InputError, require_x64
 from .export import dry_friction
 from .mjcf import MjcfSource, com_from_standard, from_mjcf, move_standard, standard_from_com
@@ -273,30 +273,20 @@ def make_gains(recording: Recording, arm: Arm) -> Gains:
     r"""Feedback that any model of the arm is compared under: that of `validate`, made to hold the arm up.
 
     The stiffness of `feedback_gains`, and what gravity takes off it in any pose of the motion, by Gershgorin's
-    circles of $\partial g / \partial q$: else an arm that leans over falls, whatever its model is worth. Damping
-    is a tenth of the stiffness, or half the critical one if that is more. `arm` is the user's for both models.
+    circles of the derivative of the torque at rest: else an arm that leans over falls, whatever its model is
+    worth. Damping is a tenth of the stiffness, or half the critical one if that is more. `arm` is the user's for
+    both models.
     """
     assert recording.tau is not None
     own = feedback_gains(recording.tau)[0]
-    slope, inertia = (
-        np.asarray(x) for x in _poses(arm, jnp.asarray(recording.q[:: -(-len(recording.q) // 64)]))
-    )
+    poses = recording.q[np.linspace(0, recording.samples - 1, 64).astype(int)]
+    rest = np.zeros_like(poses)
+    slope, inertia = slopes(arm, poses, rest, rest), np.diagonal(masses(arm, poses), axis1=1, axis2=2)
     diagonal = np.diagonal(slope, axis1=1, axis2=2)
     weakest = np.abs(slope).sum(2) - np.abs(diagonal) - diagonal
     stiffness = own + np.maximum(weakest.max(0), 0.0)
     damping = np.maximum(0.1 * stiffness, np.sqrt(stiffness * inertia.max(0)))
     return Gains(jnp.asarray(stiffness), jnp.asarray(damping))
-
-
-@jax.jit
-def _poses(arm: Arm, q: Array) -> tuple[Array, Array]:
-    """Derivative of gravity's torque by q [N m/rad], and what each joint turns [kg m²]."""
-
-    def one(q):
-        g = lambda q: gravity_torque(arm.chain, arm.standard, q)
-        return jax.jacfwd(g)(q), jnp.diag(mass_matrix(arm.chain, arm.standard, q)) + arm.armature
-
-    return jax.vmap(one)(q)
 
 
 def _opened(

@@ -18,6 +18,7 @@ from jaxpanda.effects import (
     AbstractJointEffect,
     Channels,
     Motion,
+    Stretches,
     joint_columns,
 )
 from jaxpanda.effects.contact import ExternalContact
@@ -82,7 +83,7 @@ def shapes(arm: Arm):
 def columns(effect, motion: Motion, channels: Channels) -> np.ndarray:
     if isinstance(effect, AbstractJointEffect):
         wide = np.zeros((motion.samples, motion.dof, len(effect.coefficients)))
-        wide[:, effect.joints[0]] = joint_columns([effect], channels, motion.dt)[:, 0]
+        wide[:, effect.joints[0]] = joint_columns([effect], Stretches(channels), motion.dt)[:, 0]
         return wide
     return effect.over(motion)
 
@@ -129,12 +130,14 @@ def test_derivatives_of_effects_without_memory_exist_at_rest(arm):
 
 def test_friction_takes_energy_out(arm, motion, channels):
     for effect in (CoulombFriction(2, 0.01), PreslidingHysteresis(2, 0.01, "dahl only")):
-        torque = joint_columns([effect], channels, motion.dt)[:, 0, 0]
+        torque = joint_columns([effect], Stretches(channels), motion.dt)[:, 0, 0]
         assert torque @ motion.qd[:, 2] > 0
 
 
 def test_presliding_friction_goes_over_into_coulomb_friction_beyond_its_breakaway_distance(motion, channels):
-    dahl = joint_columns([PreslidingHysteresis(3, 1e-4, "dahl only")], channels, motion.dt)[:, 0, 0]
+    dahl = joint_columns([PreslidingHysteresis(3, 1e-4, "dahl only")], Stretches(channels), motion.dt)[
+        :, 0, 0
+    ]
     sliding = np.abs(motion.qd[:, 3]) > 0.2
     np.testing.assert_allclose(dahl[sliding], np.sign(motion.qd[sliding, 3]), atol=1e-3)
 

@@ -15,7 +15,7 @@ from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.search import _score
 from jaxpanda.diagnosis.traces import prepare
-from jaxpanda.effects import Channels, joint_columns
+from jaxpanda.effects import Channels, Stretches, joint_columns
 from jaxpanda.effects import effect as effect_
 from jaxpanda.effects.drive import TorqueRipple
 from jaxpanda.effects.friction import CoulombFriction
@@ -43,10 +43,10 @@ def channels(samples: int) -> Channels:
 
 def test_a_recording_of_another_length_compiles_nothing_new():
     effects = [PreslidingHysteresis(2, 0.01, "dahl only"), PreslidingHysteresis(3, 0.02, "dahl only")]
-    joint_columns(effects, channels(4500), 0.002)
+    joint_columns(effects, Stretches(channels(4500)), 0.002)
     before = effect_._advance._cache_size()
     for samples in (50, 2048, 5000):
-        assert joint_columns(effects, channels(samples), 0.002).shape == (samples, 2, 1)
+        assert joint_columns(effects, Stretches(channels(samples)), 0.002).shape == (samples, 2, 1)
     assert effect_._advance._cache_size() == before
 
 
@@ -54,7 +54,7 @@ def test_a_recording_of_another_length_compiles_nothing_new():
 def test_columns_by_stretches_are_those_of_the_whole_recording(effect):
     s = channels(20000)
     whole = effect.columns(jax.tree.map(jax.numpy.asarray, s), 0.002)
-    assert joint_columns([effect], s, 0.002)[:, 0] == pytest.approx(np.asarray(whole), abs=1e-12)
+    assert joint_columns([effect], Stretches(s), 0.002)[:, 0] == pytest.approx(np.asarray(whole), abs=1e-12)
 
 
 def test_the_low_pass_by_products_is_the_recursive_one(problem: Problem):

@@ -11,8 +11,9 @@ from ..effects import CATALOGUE, AbstractArmEffect, AbstractEffect, AbstractJoin
 from .host import parallel
 from .traces import Trace
 
-_BATCHES = 4, 16
-"""Shapes that one compiled call takes: what a refinement tries at once, and a grid."""
+_BATCH = 4
+"""Shapes that one compiled call takes: what a refinement tries at once. A grid takes several calls, for which
+nothing more has to be traced."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,11 +37,11 @@ def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndar
     """Columns of shapes of one class and form: `(time, m, n)` in one joint, `(time, dof, m, n)` in the arm."""
     local = [e for e in effects if isinstance(e, AbstractJointEffect)]
     if local:
-        parts, size = [], next((n for n in _BATCHES if n >= len(local)), _BATCHES[-1])
-        for start in range(0, len(local), size):
-            batch = list(local[start : start + size])
-            filled = batch + [batch[-1]] * (size - len(batch))
-            fine = joint_columns(filled, trace.channels, trace.dt)
+        parts = []
+        for start in range(0, len(local), _BATCH):
+            batch = list(local[start : start + _BATCH])
+            filled = batch + [batch[-1]] * (_BATCH - len(batch))
+            fine = joint_columns(filled, trace.stretches, trace.dt)
             parts.append(trace.down(fine)[:, : len(batch)])
         return np.concatenate(parts, 1)
     arm = [e for e in effects if isinstance(e, AbstractArmEffect)]

@@ -21,17 +21,17 @@ import scipy.ndimage
 from jaxtyping import Float
 
 from .. import files
-from ..arm import Arm
 from ..effects import AbstractEffect, AbstractJointEffect, Channels, Motion
 from .decide import coefficients
 from .events import Proposal, ripple
 from .evidence import Noise
 from .finding import Finding
+from .host import parallel
 from .knowledge import Knowledge, nuisance
 from .library import columns_of
 from .problem import Problem, Term, posed
 from .search import State, grids
-from .traces import Trace, held_sign
+from .traces import TRIM, Trace, held_sign
 
 WORTH = 0.05
 """Probability from which a rival is worth an experiment."""
@@ -171,15 +171,16 @@ def _told(
     """For each motion and pair, the evidence that the motion is expected to bring [nats]."""
     old = [_pair_sums(problem, noise, pair) for pair in pairs]
     known = [_discrimination(pair, sums) for pair, sums in zip(pairs, old, strict=True)]
-    out = []
-    for one in new:
+
+    def told(one: Problem) -> list[float]:
         row = []
         for pair, before, already in zip(pairs, old, known, strict=True):
             more = _pair_sums(one, noise, pair)
             together = [_added(x, y) for x, y in zip(before, more, strict=True)]
             row.append(_discrimination(pair, together) - already)
-        out.append(row)
-    return out
+        return row
+
+    return parallel(told, new)
 
 
 def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
@@ -333,11 +334,13 @@ def _placed(
     signs = held_sign(arm, np.concatenate(speeds), np.concatenate(bends), np.full(arm.dof, 1e-4))
     out = []
     for q, qd, qdd, sign in zip(ways, speeds, bends, np.split(signs, len(ways)), strict=True):
-        time, keep = np.arange(len(q)) * dt, np.arange(0, len(q), stride)
+        time, ends = np.arange(len(q)) * dt, min(round(TRIM / dt), len(q) // 4)
+        keep = np.arange(ends, len(q) - ends, stride)
         friction = np.asarray(arm.damping) * qd + np.asarray(arm.frictionloss) * sign
         motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], friction[keep])
-        load = scipy.interpolate.CubicSpline(motion.time, motion.load)(np.minimum(time, motion.time[-1]))
-        channels = Channels(time, q, qd, qdd, load, load + friction)
+        load = scipy.interpolate.CubicSpline(motion.time, motion.load)(np.clip(time, *motion.time[[0, -1]]))
+        torque = load + friction
+        channels = Channels(time, q, qd, qdd, load, torque, torque)
         weight = np.ones(len(keep))
         new = Trace(
             "next",
@@ -392,7 +395,7 @@ class _Box:
 
     @classmethod
     def around(cls, problem: Problem) -> "_Box":
-        arm: Arm = problem.traces[0].motion.arm
+        arm = problem.arm
         every = [t.motion for t in problem.traces]
         q = np.concatenate([m.q for m in every])
         least, most = q.min(0), q.max(0)

@@ -12,6 +12,7 @@ import scipy.linalg
 from jaxtyping import Bool, Float
 
 from .. import signals as signals_
+from ..arm import Arm
 from ..effects import AbstractEffect, AbstractJointEffect
 from ..errors import InputError
 from . import catchall
@@ -60,6 +61,11 @@ class Problem:
         default_factory=threading.Lock, init=False, repr=False, compare=False
     )
     """Of what `columns` keeps."""
+
+    @property
+    def arm(self) -> Arm:
+        """The nominal one."""
+        return self.traces[0].motion.arm
 
     @property
     def dof(self) -> int:

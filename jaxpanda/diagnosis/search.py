@@ -742,7 +742,7 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
 
     A pattern search whose every round is one batch.
     """
-    arm, shapes = problem.traces[0].motion.arm, proposal.effect.shapes
+    arm, shapes = problem.arm, proposal.effect.shapes
     if not shapes and not proposal.effect.variants(arm):
         return proposal
     steps = proposal.steps[: len(shapes)]

@@ -9,17 +9,14 @@ import dataclasses
 import functools
 import itertools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.interpolate
 import scipy.ndimage
-from jaxpanda_kernels import mass_matrix as _mass_matrix
 from jaxtyping import Float
 
 from .. import signals as signals_
 from ..arm import Arm
-from ..effects import Channels, Motion
+from ..effects import Channels, Motion, Stretches, masses
 from ..recordings import Recording
 
 WORK_RATE = 100.0
@@ -29,7 +26,8 @@ FINE_RATE = 1000.0
 POSITION_CUTOFF = 12.0
 """Low-pass of q before it is differentiated, at most [Hz]."""
 _LEAST_CUTOFF = 5.0
-_TRIM = 0.4
+TRIM = 0.4
+"""Left out at both ends of a recording [s]."""
 _REST = 5.0
 """Noise of the velocity within which a joint counts as at rest, in standard deviations."""
 _GAP, _NEAR = 3.5, 0.12
@@ -57,9 +55,6 @@ _CONTINUED = 0.3
 """At the ends of a recording, over which q is fitted to continue it [s]."""
 _SOLREF, _IMPEDANCE_LEAST, _IMPEDANCE_MOST = 0.02, 0.9, 0.95
 """MuJoCo's defaults for the constraint that frictionloss is: time constant [s], impedance at rest and beyond."""
-
-
-mass_matrix = jax.jit(_mass_matrix)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +85,11 @@ class Trace:
     at rest may carry any part of its load, and none where its torque is stuck."""
     stuck: tuple[tuple[int, float, float], ...] = ()
     """Joint, start and stop [s] of stretches in which measured torque repeats itself although it must change."""
+
+    @functools.cached_property
+    def stretches(self) -> Stretches:
+        """The channels as the columns of effects are made from them."""
+        return Stretches(self.channels)
 
     @property
     def weights(self) -> Float[np.ndarray, "time dof"]:
@@ -153,7 +153,7 @@ def prepare(
         whole: one grid for all, ends and gaps included, as prediction needs.
         noise: of the torque [N m], where the recording does not tell.
     """
-    rough = signals_.prepare(recording, cutoff=3.0, rate=WORK_RATE, trim=0.0 if whole else _TRIM)
+    rough = signals_.prepare(recording, cutoff=3.0, rate=WORK_RATE, trim=0.0 if whole else TRIM)
     rate, time = rough.rate, rough.time
     position = scipy.interpolate.CubicSpline(recording.time, recording.q)(
         np.clip(time, *recording.time[[0, -1]])
@@ -304,9 +304,7 @@ def held_sign(
     the velocity over which it saturates is `least` [rad/s] at least.
     """
     level = np.asarray(arm.frictionloss)
-    M = np.asarray(mass_matrix(arm.chain, arm.standard, jnp.zeros(arm.dof))) + np.diag(
-        np.asarray(arm.armature)
-    )
+    M = masses(arm, np.zeros((1, arm.dof)))[0]
     stiffness = _IMPEDANCE_LEAST / (1 - _IMPEDANCE_LEAST) / np.maximum(np.diag(np.linalg.inv(M)), 1e-9)
     b = 2 / (_IMPEDANCE_MOST * _SOLREF)
     width = np.maximum(level / (stiffness * b), np.maximum(least, 1e-6))
@@ -323,9 +321,7 @@ def position_cutoff(
     most = min(POSITION_CUTOFF, 0.25 * rate)
     if noise is None:
         return most
-    M = np.diag(np.asarray(mass_matrix(arm.chain, arm.standard, jnp.asarray(q.mean(0))))) + np.asarray(
-        arm.armature
-    )
+    M = np.diag(masses(arm, q.mean(0)[None])[0])
     crossing = np.sqrt(noise / np.maximum(np.abs(M) * _position_noise(q), 1e-12)) / (2 * np.pi)
     return float(np.clip(1.3 * crossing.min(), min(_LEAST_CUTOFF, most), most))
 

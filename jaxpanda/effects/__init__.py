@@ -8,10 +8,13 @@ from .effect import AbstractJointEffect as AbstractJointEffect
 from .effect import AbstractMemoryEffect as AbstractMemoryEffect
 from .effect import Coefficient as Coefficient
 from .effect import Shape as Shape
+from .effect import Stretches as Stretches
 from .effect import joint_columns as joint_columns
 from .effect import sign_over_velocity as sign_over_velocity
 from .motion import Channels as Channels
 from .motion import Motion as Motion
+from .motion import masses as masses
+from .motion import slopes as slopes
 from .motion import smooth_torque as smooth_torque
 
 CATALOGUE = (

@@ -325,26 +325,34 @@ class AbstractArmEffect(AbstractEffect):
         return np.stack([effect.over(motion) for effect in effects], 2)
 
 
-_WORK = 32768
-"""Samples times shapes that one compiled call takes: recordings of any length share its compilation."""
-_LONGEST = 8192
+_STRETCH = 8192
+"""Samples that one compiled call takes: recordings of any length share its compilation."""
+
+
+class Stretches:
+    """Channels of a recording in stretches of one length, the last one filled up; cut once, for many shapes."""
+
+    def __init__(self, channels: Channels):
+        whole = jax.tree.map(np.asarray, channels)
+        self.samples, self.dof = channels.q.shape
+        self.parts = [
+            jax.tree.map(lambda a, i=begin: jax.device_put(_filled(a[i : i + _STRETCH], _STRETCH)), whole)
+            for begin in range(0, self.samples, _STRETCH)
+        ]
 
 
 def joint_columns(
-    effects: Sequence[AbstractJointEffect], channels: Channels, dt: float
+    effects: Sequence[AbstractJointEffect], stretches: Stretches, dt: float
 ) -> Float[np.ndarray, "time effects n"]:
     """Columns of many shapes of one form at once, a stretch after the other."""
-    samples, out = channels.t.shape[0], []
-    stretch = min(_WORK // len(effects), _LONGEST)
     stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *effects)
-    whole = jax.tree.map(lambda a: np.asarray(a), channels)
     leaves, structure = jax.tree.flatten(stacked)
-    z = np.zeros(_states(structure, tuple((a.shape, a.dtype) for a in leaves), channels.q.shape[1]))
-    for begin in range(0, samples, stretch):
-        part = jax.tree.map(lambda a, begin=begin: _filled(a[begin : begin + stretch], stretch), whole)
-        z, columns = _advance(stacked, z, np.asarray(begin == 0), part, dt)
+    z = np.zeros(_states(structure, tuple((a.shape, a.dtype) for a in leaves), stretches.dof))
+    out = []
+    for i, part in enumerate(stretches.parts):
+        z, columns = _advance(stacked, z, np.asarray(i == 0), part, dt)
         out.append(columns)
-    return np.concatenate([np.asarray(columns) for columns in out])[:samples]
+    return np.concatenate([np.asarray(columns) for columns in out])[: stretches.samples]
 
 
 @functools.cache

@@ -90,7 +90,7 @@ class Motion:
     @functools.cached_property
     def mass(self) -> Float[np.ndarray, "time dof dof"]:
         """The mass matrix with armature [kg m²]."""
-        return self._over(_masses, self.q)
+        return masses(self.arm, self.q)
 
     @property
     def inertia(self) -> Float[np.ndarray, "time dof"]:
@@ -100,14 +100,12 @@ class Motion:
     @functools.cached_property
     def slope(self) -> Float[np.ndarray, "time dof"]:
         """Derivative of each joint's smooth torque by its own position [N m/rad]."""
-        return self._over(_slopes, self.q, self.qd, self.qdd)
+        return np.diagonal(slopes(self.arm, self.q, self.qd, self.qdd), axis1=1, axis2=2)
 
     @functools.cached_property
     def mean_inertia(self) -> Float[np.ndarray, " dof"]:
         """What each joint turns, in the mean over some poses of the motion [kg m²]."""
-        poses = self.q[:: max(1, self.samples // 16)][:16]
-        poses = np.concatenate([poses, np.repeat(poses[-1:], 16 - len(poses), 0)])
-        return np.diagonal(np.asarray(_masses(self.arm, poses)).mean(0))
+        return np.diagonal(masses(self.arm, self.q[:: max(1, self.samples // 16)][:16]).mean(0))
 
     def sensitivity(self, dq: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, "time dof"]:
         """Change of the smooth torque [N m] for a small change `dq(t)` of the joint positions, to first order."""
@@ -127,14 +125,33 @@ class Motion:
         return self.load + self.friction
 
     def _over(self, function: Callable, *arrays: np.ndarray) -> np.ndarray:
-        """`function(arm, *arrays)` in chunks of one shape."""
-        out = []
-        for start in range(0, self.samples, _CHUNK):
-            parts = [a[start : start + _CHUNK] for a in arrays]
-            short = _CHUNK - len(parts[0])
-            padded = [np.concatenate([p, np.repeat(p[-1:], short, 0)]) if short else p for p in parts]
-            out.append(np.asarray(function(self.arm, *padded))[: _CHUNK - short])
-        return np.concatenate(out)
+        return _chunked(function, self.arm, *arrays)
+
+
+def masses(arm: Arm, q: Float[np.ndarray, "poses dof"]) -> Float[np.ndarray, "poses dof dof"]:
+    """The mass matrix with armature in some poses [kg m²]."""
+    return _chunked(_masses, arm, q)
+
+
+def slopes(
+    arm: Arm,
+    q: Float[np.ndarray, "states dof"],
+    qd: Float[np.ndarray, "states dof"],
+    qdd: Float[np.ndarray, "states dof"],
+) -> Float[np.ndarray, "states dof dof"]:
+    """Derivative of the smooth torque by the joint positions [N m/rad]."""
+    return _chunked(_slopes, arm, q, qd, qdd)
+
+
+def _chunked(function: Callable, arm: Arm, *arrays: np.ndarray) -> np.ndarray:
+    """`function(arm, *arrays)` in chunks of one shape."""
+    out = []
+    for start in range(0, len(arrays[0]), _CHUNK):
+        parts = [a[start : start + _CHUNK] for a in arrays]
+        short = _CHUNK - len(parts[0])
+        padded = [np.concatenate([p, np.repeat(p[-1:], short, 0)]) if short else p for p in parts]
+        out.append(np.asarray(function(arm, *padded))[: _CHUNK - short])
+    return np.concatenate(out)
 
 
 def smooth_torque(arm: Arm, q: Array, qd: Array, qdd: Array) -> Array:
@@ -172,13 +189,7 @@ def _sensitivity(arm, q, qd, qdd, dq, dqd, dqdd):
 
 @jax.jit
 def _slopes(arm, q, qd, qdd):
-    def one(q, qd, qdd):
-        def along(e):
-            return jax.jvp(lambda q: smooth_torque(arm, q, qd, qdd), (q,), (e,))[1] @ e
-
-        return jax.vmap(along)(jnp.eye(q.shape[0]))
-
-    return jax.vmap(one)(q, qd, qdd)
+    return jax.vmap(jax.jacfwd(lambda q, *rates: smooth_torque(arm, q, *rates)))(q, qd, qdd)
 
 
 @jax.jit

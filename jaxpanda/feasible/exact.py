@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxpanda_kernels import inertia
 from jaxtyping import Array, Float
 
@@ -117,6 +116,8 @@ def _penalised(z: Float[Array, " p"], args: tuple) -> Float[Array, ""]:
 
 
 def _run_chunk(problem: Problem, equations: tuple, keys: Array, steps: int, iterations: int):
+    import optimistix as optx  # a third of a second, for every command
+
     boxes = equations[2]
 
     def one(key):
