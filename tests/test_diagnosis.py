@@ -189,7 +189,7 @@ def test_coulomb_s_friction_belongs_to_the_richer_law_at_its_joint():
     term = lambda effect: Term(effect, (), np.ones(1))
     sticks, stribeck = PreslidingHysteresis(3, 4e-4, "whole"), StribeckFriction(3, 0.1, 0.01, 2.0, "whole")
     elsewhere = PreslidingHysteresis(4, 4e-4, "whole")
-    assert titles([term(sticks), term(stribeck), term(elsewhere)]) == [
+    assert titles([term(sticks), term(stribeck), term(elsewhere)], np.zeros(7)) == [
         "stribeck_friction",
         "stribeck_friction",
         "coulomb_friction",
@@ -199,8 +199,27 @@ def test_coulomb_s_friction_belongs_to_the_richer_law_at_its_joint():
 def test_a_soft_gear_belongs_to_the_gap_at_its_joint():
     term = lambda effect: Term(effect, (), np.ones(1))
     gap = Backlash(3, 0.01, 5000.0)
-    called = titles([term(gap), term(JointElasticity(3, 4000.0, 0.2)), term(JointElasticity(2, 4000.0, 0.2))])
+    soft, elsewhere = JointElasticity(3, 4000.0, 0.2), JointElasticity(2, 4000.0, 0.2)
+    called = titles([term(gap), term(soft), term(elsewhere)], np.zeros(7))
     assert called == ["backlash", "backlash", "joint_elasticity"]
+
+
+@pytest.mark.parametrize(
+    ("velocity", "known", "beside", "title"),
+    [
+        (0.008, 0.3, "gap", "backlash"),
+        (0.008, 0.3, "spring", "joint_elasticity"),
+        (0.008, 0.3, "none", "stribeck_friction"),
+        (0.008, 0.0, "gap", "stribeck_friction"),
+        (0.1, 0.3, "gap", "stribeck_friction"),
+    ],
+)
+def test_how_known_friction_turns_belongs_to_the_gap_at_its_joint(velocity, known, beside, title):
+    """Stribeck's friction beside backlash in four blind cases, below 0.015 rad/s and where friction was known."""
+    term = lambda effect: Term(effect, (), np.ones(1))
+    others = {"gap": [Backlash(3, 0.01, 5000.0)], "spring": [JointElasticity(3, 4000.0, 0.2)], "none": []}
+    terms = [term(e) for e in (StribeckFriction(3, velocity, 0.004, 2.0, "extra"), *others[beside])]
+    assert titles(terms, np.eye(7)[3] * known)[0] == title
 
 
 def test_a_law_that_holds_the_right_one_is_less_likely_than_it():

@@ -5,12 +5,12 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..effects import CATALOGUE, AbstractEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import Backlash, JointElasticity
-from ..effects.friction import CoulombFriction
+from ..effects.friction import CoulombFriction, StribeckFriction
 from ..effects.load import PayloadChange
 from .finding import Finding, joined
 from .problem import Problem, Term
@@ -34,6 +34,8 @@ another's is about as clear."""
 MOST_ALIKE = 2
 """Terms of one effect at one place, beyond which it is not the right one: three ripples make any shape."""
 _WIDER = ("stribeck_friction", "asymmetric_friction", "load_dependent_friction", "friction_drift")
+_TURNING = 0.02
+"""Velocity below which friction is still turning [rad/s]."""
 _TOUCHING = 0.15
 """Pause between events that happened at once [s]."""
 _LISTED = 0.01
@@ -53,7 +55,7 @@ def findings(problem: Problem, state: State, lost: Sequence[bool]) -> list[Findi
     groups = together(problem, state.terms)
     before, after = leftover(state)
     left = np.clip(after / np.maximum(before, 1e-9), 0, 1) * (after > LEFT_CLEAR)
-    names, where = titles(state.terms), shares(state)
+    names, where = titles(state.terms, problem.arm.frictionloss), shares(state)
     each = list(names)  # what happened apart in time is not one law
     for k, group in enumerate(groups):
         for i in group:
@@ -140,9 +142,15 @@ def partly(state: State) -> bool:
     return bool(np.any(main & (after > LEFT_CLEAR) & (after > LEFT * before)))
 
 
-def titles(terms: Sequence[Term]) -> list[str]:
+def titles(
+    terms: Sequence[Term], frictionloss: Float[Array, " dof"] | Float[np.ndarray, " dof"]
+) -> list[str]:
     """What each term is called beside the others: Coulomb's friction is part of the laws that hold it, softness
-    of a gear that has a gap, and a body that is held while something pushes is part of the push."""
+    of a gear that has a gap, how the friction that the model knows turns where only a rotor feels it of the gap
+    or spring beyond, and a body that is held while something pushes is part of the push.
+
+    `frictionloss`: what the model has of it in each joint [N m].
+    """
     out = []
     for term in terms:
         name = called(term.effect)
@@ -151,10 +159,22 @@ def titles(terms: Sequence[Term]) -> list[str]:
         beside = [t.effect.name for t in terms if t.effect.joints == term.effect.joints]
         if name == CoulombFriction.name:
             name = next((n for n in _WIDER if n in beside), name)
-        if name == JointElasticity.name and Backlash.name in beside:
-            name = Backlash.name
+        soft = next((n for n in (Backlash.name, JointElasticity.name) if n in beside), None)
+        if name == JointElasticity.name or (soft and _turns(term.effect, frictionloss)):
+            name = soft or name
         out.append(name)
     return out
+
+
+def _turns(effect: AbstractEffect, frictionloss: Float[Array, " dof"] | Float[np.ndarray, " dof"]) -> bool:
+    """Whether an effect is at speeds only at which known friction changes its sign.
+
+    MuJoCo's holds the joint softly, the more so the less inertia it holds, and with a gap beyond that is the
+    motor's alone.
+    """
+    if not isinstance(effect, StribeckFriction) or not float(frictionloss[effect.joints[0]]):
+        return False
+    return float(effect.stribeck_velocity) < _TURNING
 
 
 def _meets(body: AbstractEffect, push: AbstractEffect) -> bool:
@@ -168,7 +188,7 @@ def _meets(body: AbstractEffect, push: AbstractEffect) -> bool:
 def together(problem: Problem, terms: Sequence[Term]) -> list[list[int]]:
     """Which terms make one finding: those of one effect at several joints, or that happened at once."""
     out: list[list[int]] = []
-    names = titles(terms)
+    names = titles(terms, problem.arm.frictionloss)
     for i, term in enumerate(terms):
         for group in out:
             if any(names[k] == names[i] and _same(problem, terms[k], term) for k in group):

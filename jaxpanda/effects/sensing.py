@@ -286,7 +286,7 @@ class TimeDelay(AbstractArmEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("delay", "s", sign=1),)
+        return (Coefficient("delay", "s", sign=1, scale=0.02),)
 
     @property
     def equation(self) -> str:
