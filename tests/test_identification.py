@@ -28,11 +28,13 @@ from jaxpanda.identification import (
     sample_mass_gravity,
 )
 from jaxpanda.identification import one_step as feasible_fit
-from jaxpanda.identification.regression import Regression, everything, least_squares
+from jaxpanda.identification import regression as regression_module
+from jaxpanda.identification.regression import Regression, everything, least_squares, regression
 from jaxpanda.identification.statistics import covariances
 from jaxpanda.panda import panda, published
 from jaxpanda.parameters import arm_base_parameters, standard_names
 from jaxpanda.recordings import Recording, load
+from jaxpanda.signals import prepare
 
 FRICTION = Friction(
     "coulomb_viscous_offset",
@@ -219,6 +221,23 @@ def test_two_recordings_tell_more_than_one(found):
     one = identify(pair[0], panda(), folds=0)
     assert both.recordings == ("virtual.csv", "second.csv")
     assert np.median(both.classical_std / one.classical_std) < 0.8
+
+
+@pytest.mark.parametrize("joints", [1, 3])
+def test_a_long_recording_is_filtered_some_joints_at_a_time(monkeypatch, joints):
+    arm, signals = panda(), prepare(virtual(panda(), 4.0))
+    base = arm_base_parameters(arm)
+    at_once = regression(signals, arm, base, "none")
+    monkeypatch.setattr(regression_module, "_AT_ONCE", joints * len(signals.q) * base.rank)
+    np.testing.assert_array_equal(regression(signals, arm, base, "none").A, at_once.A)
+    A, tau = at_once.A, at_once.y
+    rigid = A @ (base.projection @ np.asarray(arm.standard).ravel())
+    assert np.sqrt(np.mean((tau - rigid) ** 2, 1)) == pytest.approx(_filtered_friction(signals), rel=0.2)
+
+
+def _filtered_friction(signals) -> np.ndarray:
+    friction = FRICTION.torque(jnp.asarray(signals.qd))
+    return np.sqrt(np.mean(signals.lowpass(np.asarray(friction)) ** 2, 0))
 
 
 def test_an_arm_at_rest_tells_gravity_only_and_says_so():

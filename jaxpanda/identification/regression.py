@@ -23,6 +23,7 @@ from ..parameters import Base, base_parameters
 from ..signals import Signals
 
 _CHUNK = 1024  # samples whose regressor is evaluated at once; bounds the memory
+_AT_ONCE = 2**26  # numbers of the rows of some joints at the full rate; 512 MiB of them
 _REST = 0.01  # [rad/s, m/s]: a joint that never exceeds it has not moved
 _REWEIGHTINGS = 2  # after the first, joint weights change by less than a percent
 _LEAST_SIGMA = 1e-9  # of the torque: below it a residual is round-off, as on noise-free data
@@ -70,14 +71,14 @@ def regression(signals: Signals, arm: Arm, base: Base, friction: str) -> Regress
     tau = signals.lowpass(signals.tau).T
     known = signals.lowpass(np.asarray(jax.vmap(arm.known_torque)(q, qd, qdd))).T
     independent = jnp.asarray(base.independent, int)
-    rigid = np.stack(
-        [
-            signals.lowpass(np.asarray(base_rows(arm.chain, independent, joint, q, qd, qdd)))
-            for joint in range(arm.dof)
-        ]
-    )
+    at_once = min(max(1, _AT_ONCE // (len(q) * base.rank)), arm.dof)
+    rigid = []
+    for first in range(0, arm.dof, at_once):
+        joints = np.minimum(np.arange(first, first + at_once), arm.dof - 1)
+        rows = np.asarray(base_rows(arm.chain, independent, joints, q, qd, qdd))
+        rigid += [signals.lowpass(of_joint) for of_joint in rows[: arm.dof - first]]
     own = signals.lowpass(np.asarray(columns(friction, jnp.asarray(moving(signals)))))
-    A = with_columns(rigid, np.moveaxis(own, 1, 0))
+    A = with_columns(np.stack(rigid), np.moveaxis(own, 1, 0))
     for what, values in (("torque", tau), ("motion", A), ("torque of the model's own joint physics", known)):
         if not np.all(np.isfinite(values)):
             raise InputError(
@@ -106,20 +107,20 @@ def with_columns(
 def base_rows(
     chain: Chain,
     independent: Int[Array, " base"],
-    joint: int | Int[Array, ""],
+    joints: Int[Array, " some"] | Int[np.ndarray, " some"],
     q: Float[Array, "time dof"],
     qd: Float[Array, "time dof"],
     qdd: Float[Array, "time dof"],
-) -> Float[Array, "time base"]:
-    """One joint's rows of the regressor, independent columns only.
+) -> Float[Array, "some time base"]:
+    """Some joints' rows of the regressor, independent columns only.
 
-    One joint at a time, since a long recording's whole regressor would not fit in memory.
+    Not always all joints', since a long recording's whole regressor would not fit in memory.
     """
 
-    def row(sample):
-        return regressor(chain, *sample)[joint].ravel()[independent]
+    def rows(sample):
+        return regressor(chain, *sample).reshape(len(sample[0]), -1)[joints][:, independent]
 
-    return jax.lax.map(row, (q, qd, qdd), batch_size=_CHUNK)
+    return jnp.moveaxis(jax.lax.map(rows, (q, qd, qdd), batch_size=_CHUNK), 1, 0)
 
 
 def everything(regressions: Sequence[Regression]) -> Masks:
