@@ -1,4 +1,4 @@
-"""How long a diagnosis of two 20 s recordings of a 7-joint arm takes.
+"""How long a diagnosis of two 20 s recordings of a 7-joint arm takes, and their identification.
 
     python experiments/speed/diagnosis.py                  # cold, from the compilation cache, warm
     python experiments/speed/diagnosis.py --platform cpu   # on a machine with a GPU: without it
@@ -10,6 +10,7 @@ The arm is the project's Panda in MuJoCo's C engine, with viscous friction in jo
 - cached: a new process that finds the compiled programs on disk; imports are counted apart;
 - warm: the same recordings again in that process;
 - other lengths: recordings of 18.3 s and 19.4 s in that process, and how many programs compile for them.
+- identify: base parameters and friction from the first two recordings, five folds; the first compiles.
 
 Prints one JSON document; times in seconds, process time beside wall time.
 """
@@ -89,7 +90,19 @@ def diagnoses(folder: Path, rounds: int) -> dict:
         )
         out["other lengths"] = run("other")
         out["other lengths"]["programs compiled"] = len(compiled)
+        out["identify"] = identifications(folder, rounds + 1)
     return out | {"device": str(jax.devices()[0]), "jax": jax.__version__}
+
+
+def identifications(folder: Path, rounds: int) -> list[dict]:
+    """`identify` again and again."""
+    from jaxpanda.identification import identify
+    from jaxpanda.mjcf import from_mjcf
+    from jaxpanda.recordings import load
+
+    arm, _ = from_mjcf(folder / "model.xml")
+    recordings = [load(folder / f"one_{k}.csv") for k in (0, 1)]
+    return [timed(lambda: identify(recordings, arm))[1] for _ in range(rounds)]
 
 
 def child(folder: Path, cache: Path, rounds: int, platform_: str | None) -> dict:

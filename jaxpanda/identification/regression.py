@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import Chain, regressor
 from jaxtyping import Array, Bool, Float, Int
+from threadpoolctl import threadpool_limits
 
 from ..arm import Arm
 from ..errors import InputError
@@ -184,6 +185,8 @@ class Fit:
     """Link parameters behind it, where the fit goes by them."""
 
 
+# The products are small: on a busy machine BLAS's threads would wait for each other.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def least_squares(regressions: Sequence[Regression], masks: Masks, weighting: str) -> Fit:
     r"""$\min_x \sum_j \lVert y_j - A_j x\rVert^2 / \sigma_j^2$.
 
