@@ -131,6 +131,17 @@ def test_nothing_is_recommended_where_nothing_is_in_doubt(known):
     assert next_motion(problem, state, [sure], spread, "exact") is None
 
 
+def test_a_rival_that_no_motion_rules_out_is_not_decided(known):
+    """A spring may be as soft as it likes, and is an offset then."""
+    problem, spread, state, finding = known
+    either = dataclasses.replace(finding, alternatives=(("joint_spring", 0.4),))
+    assert next_motion(problem, state, [either], spread, "exact") is None
+    both = dataclasses.replace(finding, alternatives=(("asymmetric_friction", 0.4), ("joint_spring", 0.4)))
+    motion = next_motion(problem, state, [both], spread, "exact")
+    assert motion is not None
+    assert [told.rival for told in motion.pairs] == ["asymmetric_friction"]
+
+
 def test_an_effect_of_the_size_that_would_have_shown_has_the_evidence_it_needs(known):
     problem = known[0]
     state = with_terms(problem, ())

@@ -35,6 +35,8 @@ from .traces import TRIM, Trace, held_sign
 
 WORTH = 0.05
 """Probability from which a rival is worth an experiment."""
+LEAST = 1.0
+"""Evidence below which no motion decides [nats]: a rival that holds the finding as a special case stays."""
 _RIVALS, _FINALISTS = 3, 2
 _SHAPES = 16
 """Shapes of a rival that are tried in each of its forms, at most."""
@@ -131,7 +133,7 @@ def next_motion(
     spread: Float[np.ndarray, "standard n"],
     knowledge: Knowledge,
 ) -> NextMotion | None:
-    """The motion that tells best what the findings are confused with; None where nothing is worth it."""
+    """The motion that tells best what the findings are confused with; None where none is worth it or tells."""
     pairs = [pair for finding in found for pair in _pairs(problem, state, finding)][:_RIVALS]
     if not pairs:
         return None
@@ -140,12 +142,18 @@ def next_motion(
     kinds, ways = zip(*motions(problem, trace, joints), strict=True)
     new = _placed(trace, ways, spread, knowledge, problem.background)
     quick = _told(problem, new, state.noise, [pair.alone for pair in pairs])
+    decidable = [k for k in range(len(pairs)) if max(row[k] for row in quick) >= LEAST]
+    if not decidable:
+        return None
+    pairs, quick = [pairs[k] for k in decidable], [[row[k] for k in decidable] for row in quick]
     best = sorted(range(1, len(new)), key=lambda i: -min(quick[i]))[:_FINALISTS]
     chosen = [0, *best]
     told = _told(problem, [new[i] for i in chosen], state.noise, pairs)
     results = [(kinds[i], ways[i], nats) for i, nats in zip(chosen, told, strict=True)]
     repeated = results[0][2]
     kind, q, told = max(results, key=lambda one: min(one[2]))
+    if max(told) < LEAST:
+        return None
     return NextMotion(
         kind,
         np.arange(len(q)) * trace.dt,
