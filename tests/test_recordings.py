@@ -304,6 +304,8 @@ def test_what_an_arm_may_do_is_no_reading_that_stands_alone(tmp_path, shape):
         made.tau[np.flatnonzero(np.diff(made.tau[:, 0]))[0] + 2, 0] *= -1
     elif shape == "an encoder's last digit":
         made.q[:, 1] = 0.7 + 1e-5 * (rng.random(2000) < 0.002)
+        made.q[:, 2] = 0.1 + 1e-6 * rng.normal(size=2000)
+        made.q[-1, 2] += 1e-3  # as the iiwa's sixth joint at the end of a log
     else:
         made.tau[:] += 0.1 * rng.standard_t(2.5, size=made.tau.shape)
     _saved(made, tmp_path)

@@ -9,6 +9,8 @@ from .recording import Recording
 
 LEFT_OUT = "rows left out, as a reading in them stands alone"
 """What the account of repairs says."""
+_LEAST = {"q": 0.01, "tau": 1.0}
+"""How far from those beside it [rad, N m]; what is nearer does no harm."""
 _LONGEST = 3
 """Rows that such a reading lasts, at most."""
 _BEYOND = 0.5
@@ -33,7 +35,7 @@ def without_glitches(recording: Recording) -> Recording:
         f"{name}_{j + 1}": alone
         for name, channel in channels.items()
         for j in range(channel.shape[1])
-        if (alone := _alone(channel[:, j])).any()
+        if (alone := _alone(channel[:, j], _LEAST[name])).any()
     }
     bad = np.any([*found.values()], axis=0) if found else np.zeros(recording.samples, bool)
     if not bad.any() or bad.mean() > _FEW:
@@ -63,7 +65,7 @@ def _and_others(found: dict[str, Bool[np.ndarray, " time"]]) -> str:
     return f" (in all: {said})" if sum(more.values()) > 1 else ""
 
 
-def _alone(x: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
+def _alone(x: Float[np.ndarray, " time"], least: float) -> Bool[np.ndarray, " time"]:
     """Where a reading lies beyond all the others, and comes and goes within a few rows."""
     out = np.zeros(len(x), bool)
     low, high = np.quantile(x, [0.005, 0.995])
@@ -72,7 +74,7 @@ def _alone(x: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
     if not edges.size:
         return out
     steps = np.abs(np.diff(x))
-    jump = _JUMP * max(np.quantile(steps, _USUAL), np.min(steps[steps > 0], initial=np.inf))
+    jump = max(least, _JUMP * np.quantile(steps, _USUAL), _JUMP * np.min(steps[steps > 0], initial=np.inf))
     for first, last in edges.reshape(-1, 2):
         if last - first > _LONGEST:
             continue
