@@ -177,13 +177,13 @@ class Corrected(eqx.Module):
             tau = tau + motion.regressor @ np.asarray(self.change).ravel()
         pairs = list(zip(self.effects, self.coefficients, strict=True))
         for last in (False, True):
-            channels = dataclasses.replace(channels, shown=tau.copy() if last else None)
+            stretches = Stretches(dataclasses.replace(channels, shown=tau.copy() if last else None))
             for bound, c in pairs:
                 effect = bound.placed("", later=True)
                 if effect is None or effect.takes_shown != last:
                     continue
                 if isinstance(effect, AbstractJointEffect):
-                    columns = joint_columns([effect], Stretches(channels), motion.dt)[:, 0]
+                    columns = joint_columns([effect], stretches, motion.dt)[:, 0]
                     tau[:, effect.joints[0]] += columns @ np.asarray(c)
                 else:
                     tau = tau + effect.over(motion) @ np.asarray(c)  # pyright: ignore

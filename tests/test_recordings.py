@@ -237,6 +237,7 @@ def _npz(tmp_path, **arrays):
         ({"dq": np.zeros((199, 3))}, r"array dq has the shape \(199, 3\)"),
         ({"qd": np.zeros((200, 3))}, "arrays dq and qd are both there"),
         ({"q": np.full((200, 3), None)}, "no plain arrays"),
+        ({"time": np.zeros(0)} | dict.fromkeys(("q", "dq", "tau"), np.zeros((0, 3))), "too short, 0 rows"),
         ({"q": np.full((200, 3), "1")}, "where real numbers are needed"),
         ({"tau": np.full((200, 3), np.nan)}, "column tau_1, row 1: the value is nan and 199 more"),
     ],

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .motion import Channels, Motion
+from .motion import Channels, Motion, filled
 
 Numbers = Float[Array, " n"] | Float[np.ndarray, " n"]
 """Coefficients, which may be traced."""
@@ -336,7 +336,7 @@ class Stretches:
         whole = jax.tree.map(np.asarray, channels)
         self.samples, self.dof = channels.q.shape
         self.parts = [
-            jax.tree.map(lambda a, i=begin: jax.device_put(_filled(a[i : i + _STRETCH], _STRETCH)), whole)
+            jax.tree.map(lambda a, i=begin: jax.device_put(filled(a[i : i + _STRETCH], _STRETCH)), whole)
             for begin in range(0, self.samples, _STRETCH)
         ]
 
@@ -361,11 +361,6 @@ def _states(structure: Any, leaves: tuple[tuple, ...], dof: int) -> tuple[int, .
     effects = jax.tree.unflatten(structure, [jnp.zeros(*leaf) for leaf in leaves])
     q = jnp.zeros((1, dof))
     return jax.eval_shape(_starts, effects, Channels(q[:, 0], q, q, q, q, q)).shape
-
-
-def _filled(a: np.ndarray, length: int) -> np.ndarray:
-    short = length - len(a)
-    return np.concatenate([a, np.repeat(a[-1:], short, 0)]) if short else a
 
 
 def _starts(effects, channels):

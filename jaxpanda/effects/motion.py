@@ -147,11 +147,15 @@ def _chunked(function: Callable, arm: Arm, *arrays: np.ndarray) -> np.ndarray:
     """`function(arm, *arrays)` in chunks of one shape."""
     out = []
     for start in range(0, len(arrays[0]), _CHUNK):
-        parts = [a[start : start + _CHUNK] for a in arrays]
-        short = _CHUNK - len(parts[0])
-        padded = [np.concatenate([p, np.repeat(p[-1:], short, 0)]) if short else p for p in parts]
-        out.append(np.asarray(function(arm, *padded))[: _CHUNK - short])
-    return np.concatenate(out)
+        parts = [filled(a[start : start + _CHUNK], _CHUNK) for a in arrays]
+        out.append(np.asarray(function(arm, *parts)))
+    return np.concatenate(out)[: len(arrays[0])]
+
+
+def filled(a: np.ndarray, length: int) -> np.ndarray:
+    """Rows up to a length, the last one again and again."""
+    short = length - len(a)
+    return np.concatenate([a, np.repeat(a[-1:], short, 0)]) if short else a
 
 
 def smooth_torque(arm: Arm, q: Array, qd: Array, qdd: Array) -> Array:

@@ -31,8 +31,8 @@ def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Re
     _finite(recording, row)
     _ordered(recording, row)
     _rate(recording)
-    recording = without_glitches(recording)
     _long_enough(recording)
+    recording = without_glitches(recording)
     _radians(recording)
     _velocity_unit(recording)
     return recording

@@ -31,19 +31,14 @@ def without_glitches(recording: Recording) -> Recording:
     simulation under that torque goes.
     """
     channels = {"q": recording.q} | ({} if recording.tau is None else {"tau": recording.tau})
-    found = {
-        f"{name}_{j + 1}": alone
-        for name, channel in channels.items()
-        for j in range(channel.shape[1])
-        if (alone := _alone(channel[:, j], _LEAST[name])).any()
-    }
+    columns = {(name, j): x for name, channel in channels.items() for j, x in enumerate(channel.T)}
+    alone = {(name, j): _alone(x, _LEAST[name]) for (name, j), x in columns.items()}
+    found = {place: where for place, where in alone.items() if where.any()}
     bad = np.any([*found.values()], axis=0) if found else np.zeros(recording.samples, bool)
     if not bad.any() or bad.mean() > _FEW:
         return recording
-    column, alone = next(iter(found.items()))
-    i = int(np.argmax(alone))
-    value = channels[column.split("_")[0]][i, int(column.split("_")[1]) - 1]
-    keep = ~bad
+    (name, j), where = next(iter(found.items()))
+    i, keep = int(np.argmax(where)), ~bad
     return dataclasses.replace(
         recording,
         time=recording.time[keep],
@@ -53,16 +48,19 @@ def without_glitches(recording: Recording) -> Recording:
         repairs={**recording.repairs, LEFT_OUT: int(bad.sum())},
         notes=(
             *recording.notes,
-            f"{recording.name}: column {column} reads {value:g} at {recording.time[i]:g} s, far from all other"
-            f" readings and from those beside it{_and_others(found)}; such rows are left out",
+            f"{recording.name}: column {name}_{j + 1} reads {columns[name, j][i]:g} at {recording.time[i]:g} s,"
+            f" far from all other readings and from those beside it{_and_others(found)}; such rows are left out",
         ),
     )
 
 
-def _and_others(found: dict[str, Bool[np.ndarray, " time"]]) -> str:
-    more = {name: int(np.sum(np.diff(alone, prepend=False) & alone)) for name, alone in found.items()}
-    said = ", ".join(f"{name} {count} times" if count > 1 else name for name, count in more.items())
-    return f" (in all: {said})" if sum(more.values()) > 1 else ""
+def _and_others(found: dict[tuple[str, int], Bool[np.ndarray, " time"]]) -> str:
+    counts = [int(np.sum(np.diff(where, prepend=False) & where)) for where in found.values()]
+    said = [
+        f"{name}_{j + 1}" + (f" {count} times" if count > 1 else "")
+        for (name, j), count in zip(found, counts, strict=True)
+    ]
+    return f" (in all: {', '.join(said)})" if sum(counts) > 1 else ""
 
 
 def _alone(x: Float[np.ndarray, " time"], least: float) -> Bool[np.ndarray, " time"]:
