@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import NOISE, record
+from helpers import NOISE, excitation, record
 
-from jaxpanda import Arm, InputError
+from jaxpanda import Arm, InputError, Recording
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
 from jaxpanda.diagnosis.decide import titles
@@ -41,6 +41,7 @@ from jaxpanda.effects.drive import Backlash, JointElasticity
 from jaxpanda.effects.friction import CoulombFriction, FrictionDrift, StribeckFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.export import panda_mjcf
 from jaxpanda.report import to_html
 
 
@@ -159,6 +160,68 @@ def test_what_no_effect_explains_is_called_unknown():
     assert result.verdict in ("unexplained", "partly_explained")
     assert ("unknown", (2,)) in {(f.effect, f.joints) for f in result.findings}
     assert result.fit.held_out_rmse_after[2] < 0.5 * result.fit.held_out_rmse_before[2]
+
+
+def coupled(t, q, qd, qdd):
+    """A hose led past joints 3 and 6."""
+    x, y = q[:, 2], q[:, 5] - 2.0
+    return 6.0 * x * y + 9.0 * y**2 * x - 5.0 * x**2
+
+
+def notched(t, q, qd, qdd):
+    x = (q[:, 2] - 0.05) / 0.05
+    return 0.4 * x * np.exp(-0.5 * x**2)
+
+
+@pytest.mark.parametrize("law", [coupled, notched])
+def test_a_torque_without_a_name_is_predicted_in_a_motion_never_seen(law, tmp_path):
+    result = diagnose(None, [record(0, at_joint(3, law)), record(1, at_joint(3, law))])
+    assert {(f.effect, f.joints) for f in result.findings} == {("unknown", (2,))}
+    assert result.fit.held_out_rmse_before[2] > 2 * result.fit.noise_floor[2]
+    result.save(tmp_path / "out")
+    other = record(7, at_joint(3, law))
+    error = predict(tmp_path / "out", other) - other.tau
+    np.testing.assert_allclose(np.sqrt(np.mean(error**2, 0)), NOISE, rtol=0.15)
+
+
+@pytest.mark.parametrize("v", [0.005, 0.02])
+def test_how_known_friction_turns_is_no_finding(v, tmp_path):
+    """Not as MuJoCo's constraint: that was called Stribeck's friction, or a drift of it."""
+    model = tmp_path / "rubs.xml"
+    model.write_text(panda_mjcf().replace("<joint name=", '<joint frictionloss="0.5" name='))
+    rubs = lambda t, q, qd, qdd: 0.5 * np.tanh(qd / v)
+    result = diagnose(model, [record(0, rubs), record(1, rubs)])
+    assert result.verdict == "consistent", result.lines()
+    assert any("joint 7 turns" in note or "7 turns" in note for note in result.notes), result.notes
+
+
+PLANAR = """<mujoco><compiler angle="radian"/><worldbody><body>
+  <joint name="j1" axis="0 0 1"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03"/><body pos=".4 0 0">
+  <joint name="j2" axis="0 0 1" frictionloss="{loss}"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
+  <body pos=".3 0 0"><joint name="j3" axis="0 0 1"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".03"/>
+  </body></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("gain", "rub", "named"), [(1.5, 0.3, "inertial_parameters"), (1.0, 0.0, "coulomb_friction")]
+)
+def test_a_model_whose_own_numbers_are_wrong_is_not_consistent(gain, rub, named, tmp_path):
+    """Refitting them explains all, and so nothing was found."""
+    model = tmp_path / "planar.xml"
+    model.write_text(PLANAR.format(loss=0.3))
+    arm, rng, t = Arm.from_mjcf(model), np.random.default_rng(3), np.arange(2400) / 200
+    made = []
+    for seed in range(2):
+        q, qd, qdd = excitation(dataclasses.replace(arm, lower=-jnp.ones(3), upper=jnp.ones(3)), t, seed)
+        load = Motion(arm, t, q, qd, qdd, np.zeros_like(q)).load
+        tau = gain * load + rub * np.tanh(qd / 0.01) * [0, 1, 0] + 0.002 * rng.normal(size=q.shape)
+        made.append(Recording(f"{seed}.csv", t, q + 1e-6 * rng.normal(size=q.shape), qd=qd, tau=tau))
+    result = diagnose(model, made)
+    assert named in {f.effect for f in result.findings}, result.lines()
+    result.save(tmp_path / "out")
+    error = predict(tmp_path / "out", made[0]) - made[0].tau
+    before = result.fit.held_out_rmse_before
+    assert np.all(np.sqrt(np.mean(error[80:-80] ** 2, 0)) < 0.3 * before)
 
 
 def test_what_the_healthy_arm_shows_already_is_not_reported():

@@ -28,7 +28,7 @@ from jaxpanda.effects.load import GravityDirection, InertialParameters, Payload,
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TimeDelay, TorqueDrift
 from jaxpanda.effects.twist import Law, twist_torque
-from jaxpanda.effects.unknown import Unknown
+from jaxpanda.effects.unknown import Unknown, UnknownAt, UnknownOfTwo
 
 NAMES = {
     "viscous_friction", "coulomb_friction", "asymmetric_friction", "stribeck_friction",
@@ -71,6 +71,8 @@ def shapes(arm: Arm):
         ExternalContact(4, 1.0, 2.0, "a.csv", "link"),
         ExternalContact(4, 1.0, 2.0, "a.csv", "point base", (0.0, 0.1, 0.05)),
         ExternalContact(4, 1.0, 2.0, "a.csv", "point link", (0.0, 0.1, 0.05)),
+        UnknownOfTwo(2, 1, (-0.4, -0.4), (0.4, 0.4)),
+        UnknownAt(2, 0.1, 0.2),
         *(Unknown(2, 2, (-0.4, 0.0, 0.4), form) for form in ("of q", "of q_k", "friction of q")),
     ]
     kinds = {}

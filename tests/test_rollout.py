@@ -23,7 +23,7 @@ from jaxpanda.effects.friction import CoulombFriction, LoadDependentFriction, St
 from jaxpanda.effects.load import Payload, PayloadChange
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TorqueOffset
-from jaxpanda.effects.unknown import Unknown
+from jaxpanda.effects.unknown import Unknown, UnknownAt, UnknownOfTwo
 from jaxpanda.mjcf import from_document
 from jaxpanda.recordings import Recording
 from jaxpanda.simulation import JointFriction, Sensors, fourier_trajectory, simulate
@@ -56,6 +56,8 @@ def every_kind(arm: Arm) -> Corrected:
         (PreslidingHysteresis(1, 0.01, "dahl extra"), [0.2]),
         (LoadDependentFriction(1, 0.02, 1.1, "coulomb"), [0.03, 0.1]),
         (Unknown(0, 1, (-1.0, 0.0, 1.0), "of q_k"), [0.2, -0.1, 0.1]),
+        (UnknownOfTwo(1, 0, (-1.0, -1.0), (1.0, 1.0)), [0.02 * k for k in range(10)]),
+        (UnknownAt(0, 0.2, 0.1), [0.1, -0.2, 0.2]),
         (PayloadChange(1, 1.0, EVER, "a.csv", "gained"), body),
         (ExternalContact(1, 0.7, 1.2, "a.csv", "point base", (0.1, 0.0, 0.0)), [3.0, 0.0, 5.0]),
         (JointElasticity(0, 800.0, 0.2), [1 / 800]),

@@ -1,17 +1,23 @@
 """Free-form hypotheses for each joint: they compete with the catalogue, so that it is not believed blindly."""
 
+import itertools
 from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
 
-from ..effects.unknown import FORMS, Unknown
+from ..effects.unknown import FORMS, Unknown, UnknownOfTwo
 from .host import parallel
 from .library import Candidates, columns_of
 from .traces import Trace
 
 _KNOTS = {"odd in dq": 8, "even in dq": 8, "of q": 10, "friction of q": 9}
 _FEW = 6
+_MOVES = 0.02
+"""Travel from which a joint's position may count beside another's [rad]."""
+
+Free = Unknown | UnknownOfTwo
+
 _KINDS = {
     "odd in dq": lambda m, j: np.abs(m.qd[:, j]),
     "even in dq": lambda m, j: np.abs(m.qd[:, j]),
@@ -28,7 +34,7 @@ _KINDS = {
 def build(traces: Sequence[Trace]) -> list[Candidates]:
     """Every free form at every joint, with knots where the recordings have been."""
     dof = traces[0].motion.dof
-    alike: dict[tuple, list[Unknown]] = defaultdict(list)
+    alike: dict[tuple, list[Free]] = defaultdict(list)
     for form in FORMS:
         for j in range(dof):
             for k in range(dof) if form.endswith("_k") else (j,):
@@ -36,7 +42,12 @@ def build(traces: Sequence[Trace]) -> list[Candidates]:
                 if (k != j or not form.endswith("_k")) and len(knots) > 2:
                     alike[form, len(knots)].append(Unknown(j, k, tuple(knots.tolist()), form))
 
-    def evaluated(same: list[Unknown]) -> list[Candidates]:
+    low, high = np.quantile(np.concatenate([t.motion.q for t in traces]), (0.005, 0.995), axis=0)
+    for j, k in itertools.permutations(np.flatnonzero(high - low > _MOVES).tolist(), 2):
+        ends = tuple((float(x[j]), float(x[k])) for x in (low, high))
+        alike["of q, q_k", 0].append(UnknownOfTwo(j, k, *ends))
+
+    def evaluated(same: list[Free]) -> list[Candidates]:
         columns = [columns_of(same, trace) for trace in traces]
         return [
             Candidates((effect,), effect.joints[0], tuple(c[:, i : i + 1] for c in columns))

@@ -2,7 +2,7 @@
 
 import itertools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -10,14 +10,15 @@ from jaxtyping import Array, Float
 from ..effects import CATALOGUE, AbstractEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import Backlash, JointElasticity
-from ..effects.friction import CoulombFriction, StribeckFriction
-from ..effects.load import PayloadChange
+from ..effects.friction import CoulombFriction, StribeckFriction, ViscousFriction
+from ..effects.load import InertialParameters, PayloadChange
+from ..effects.sensing import TorqueGain
 from .finding import Finding, joined
 from .problem import Problem, Term
 from .rivals import called, odds
 from .search import State, instead, leftover, places, shares, without
 from .uncertainty import covariances
-from .unnamed import hum, standing_off, stuck
+from .unnamed import BEYOND, hum, standing_off, stuck
 
 LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05
 """When a joint is not fully explained: this share of its squared residual beyond noise is left, more than this
@@ -44,6 +45,8 @@ DOUBTFUL = 0.2
 """Confidence below which what a finding stands for counts as not explained."""
 UNLIKELY = 0.1
 """Confidence below which one of several findings loses its name."""
+REFITTED = 0.9
+"""Confidence that a model's numbers are wrong, where their refit explains what differs and nothing else does."""
 
 
 def findings(problem: Problem, state: State, lost: Sequence[bool]) -> list[Finding]:
@@ -68,12 +71,70 @@ def findings(problem: Problem, state: State, lost: Sequence[bool]) -> list[Findi
     spread = covariances(problem, state)
     out = [_finding(problem, state, group, names[group[0]], rivals, doubt, spread) for group in groups]
     out = unnamed_where_doubtful(problem, state, out)
+    if all(lost) and all(p <= UNLIKELY for f in out for p in (f.confidence, *dict(f.alternatives).values())):
+        out = []  # none is likely, and none predicts torque
     # what is in the band of the search belongs to what was found there
     lowest = {"lowest": problem.traces[0].cutoff} if out else {}
     halted = stuck(problem, state.noise.std)
     unnamed = hum([t.signals for t in problem.traces], problem.active, state.noise.std, **lowest)
     unnamed = unnamed or (None if out else standing_off(problem, state))
     return sorted(out, key=lambda f: -f.evidence) + [f for f in (halted, unnamed) if f is not None]
+
+
+def numbers(
+    problem: Problem, state: State, changes: Callable[[Float[np.ndarray, " n"]], tuple[np.ndarray, ...]]
+) -> list[Finding]:
+    """The model's own numbers as what is wrong, where their refit explains a joint far beyond its noise.
+
+    `changes`: what coefficients of the nuisance mean for standard parameters, damping and frictionloss.
+    """
+    n = problem.nuisance[0].shape[2]
+    values = changes(state.design.x[:n])
+    root = np.linalg.cholesky(np.linalg.inv(state.design.information)[:n, :n])
+    deviations = [np.sqrt(np.sum(np.square(part), 0)) for part in zip(*map(changes, root.T), strict=True)]
+    suspect = [t for t, on in zip(problem.traces, problem.active, strict=True) if on]
+    weights = np.concatenate([t.weights for t in suspect])
+    felt = (
+        [t.motion.regressor @ values[0].ravel() for t in suspect],
+        [t.motion.qd * values[1] for t in suspect],
+        [t.down(t.sign) * values[2] for t in suspect],
+    )
+    told = (
+        (InertialParameters.name, "mass_change", "kg", "Y(q, dq, ddq) * (change of inertial parameters)"),
+        (ViscousFriction.name, "damping", "N·m·s/rad", "damping * dq, beyond the model's"),
+        (CoulombFriction.name, "coulomb", "N·m", "coulomb * sign(dq), beyond the model's"),
+    )
+    out = []
+    for torque, value, std, (name, parameter, unit, law) in zip(felt, values, deviations, told, strict=True):
+        power = np.mean((np.concatenate(torque) * weights) ** 2, 0) / np.maximum(np.mean(weights**2, 0), 1e-9)
+        joints = tuple(np.flatnonzero(power > BEYOND * state.noise.std**2).tolist())
+        if not joints:
+            continue
+        whole = value.ndim > 1  # links beyond a joint act in it
+        parts = ((j, value[j, 0], std[j, 0]) if whole else (j, value[j], std[j]) for j in range(problem.dof))
+        out.append(
+            Finding(
+                effect=name,
+                joints=joints,
+                recordings=tuple(t.name for t in suspect),
+                intervals=None,
+                confidence=REFITTED,
+                alternatives=((TorqueGain.name, round(1 - REFITTED, 3)),),
+                equation=f"tau = {law}",
+                parameters=tuple(
+                    {"name": parameter, "joint": j + 1, "value": float(v), "std": float(s), "unit": unit}
+                    for j, v, s in parts
+                    if whole or j in joints
+                ),
+                rms_torque=np.sqrt(power),
+                evidence=float(0.5 * len(weights) * np.sum(power / state.noise.std**2)),
+                summary=f"The simulation's own numbers are not this arm's ({name.replace('_', ' ')}): refitted"
+                f" together they explain up to {np.sqrt(power.max()):.3g} N·m rms, at joint"
+                f" {int(power.argmax()) + 1}. Torque sensors of a wrong scale could look alike.",
+                terms=(),
+            )
+        )
+    return sorted(out, key=lambda f: -f.evidence)
 
 
 def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Finding]) -> list[Finding]:

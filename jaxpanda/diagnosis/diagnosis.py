@@ -21,7 +21,7 @@ from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, load
 from . import knowledge as knowledge_
 from .coverage import HeatMap, Least, heat_map, least_shown
-from .decide import DOUBTFUL, coefficients, findings, partly
+from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import Finding
 from .host import on_host
 from .localise import Localisation, localise, unbiased
@@ -31,6 +31,7 @@ from .problem import FOLDS, Problem
 from .search import ELECTIONS, State, elected, transferable
 from .traces import Trace, prepare
 from .uncertainty import polished
+from .unnamed import BEYOND
 
 CORRECTED = "corrected.json"
 """What `predict` reads."""
@@ -208,7 +209,9 @@ def diagnose(
     kept = transferable(problem, state)
     lost = [all(t is not k for k in kept.terms) for t in state.terms]
     found = tuple(findings(problem, state, lost))
-    corrected = _corrected(arm, premises, kept)
+    contradicted = premises.knowledge != knowledge
+    wrong = numbers(problem, state, premises.changes) if contradicted and not found else []
+    corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
     if any(lost):
         dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
         premises = dataclasses.replace(
@@ -216,11 +219,12 @@ def diagnose(
             notes=(*premises.notes, "left out of the corrected model, as torque is predicted no better with it"
                    f" where it was not fitted: {', '.join(sorted(dropped))}"),
         )  # fmt: skip
-    text, warnings = _corrected_xml(source, corrected)
+    # numbers that only moved within what they were uncertain by stay as the user wrote them
+    text, warnings = _corrected_xml(source, corrected if wrong else corrected.as_written)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
-        verdict=_verdict(found, partly(state)),
-        findings=found,
+        verdict=_verdict((*found, *wrong), partly(state)),
+        findings=(*found, *wrong),
         fit=fit(problem, kept),
         corrected=corrected,
         corrected_xml=text,
@@ -229,6 +233,7 @@ def diagnose(
             *repairs,
             *(n for t in traces for n in _still(t)),
             *_unheard(problem),
+            *_turned(problem, state),
             *(n for t in traces for n in t.signals.notes),
             *warnings,
         ),
@@ -250,6 +255,21 @@ def _still(trace: Trace) -> list[str]:
     return [
         f"{trace.name}: {named} never moved; friction at rest may carry any part of the load there, so that"
         " torque was not judged"
+    ]
+
+
+def _turned(problem: Problem, state: State) -> list[str]:
+    """A sentence about the joints whose known friction turns otherwise than MuJoCo's, beyond the noise."""
+    stop = problem.nuisance[0].shape[2] - sum(len(t.deviation) for t in problem.background)
+    stop -= problem.traces[0].shaken.shape[2]
+    at = slice(stop - problem.traces[0].turning.shape[2], stop)
+    torque = np.concatenate([N[:, :, at] @ state.design.x[at] for N in problem.nuisance])
+    joints = [str(j + 1) for j in np.flatnonzero(np.mean(torque**2, 0) > BEYOND * state.noise.std**2)]
+    if not joints:
+        return []
+    return [
+        f"the model's friction at joint{'s' * (len(joints) > 1)} {', '.join(joints)} turns over another range of"
+        " speeds than MuJoCo's constraint does, which is no finding (solreffriction and solimpfriction set it)"
     ]
 
 
@@ -337,14 +357,14 @@ def _verdict(found: Sequence[Finding], partly: bool) -> str:
     return "unexplained" if set(names) == {"unknown"} else "partly_explained"
 
 
-def _corrected(arm: Arm, premises: Premises, state: State) -> Corrected:
-    """The arm with the terms, and with what they leave of the nuisance; as it was where nothing was found."""
+def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) -> Corrected:
+    """The arm with the terms and, where `refitted`, with what they leave of the nuisance."""
     problem = premises.problem
-    x = state.design.x[: problem.nuisance[0].shape[2]] * (1.0 if state.terms else 0.0)
-    change, damping, level = knowledge_.changes(arm, x, premises.spread, premises.knowledge)
+    x = state.design.x[: problem.nuisance[0].shape[2]] * (1.0 if refitted else 0.0)
+    change, damping, level = premises.changes(x)
     effects, values = [], []
     at = len(x) - sum(len(t.deviation) for t in premises.background)
-    for term in premises.background if state.terms else ():
+    for term in premises.background if refitted else ():
         effects.append(term.effect)
         values.append(jnp.asarray(x[at : at + len(term.deviation)] * term.deviation))
         at += len(term.deviation)
@@ -361,14 +381,12 @@ def _corrected(arm: Arm, premises: Premises, state: State) -> Corrected:
 
 
 def _corrected_xml(source: MjcfSource, corrected: Corrected) -> tuple[str, tuple[str, ...]]:
-    """The user's file with what MuJoCo holds natively put in, and what could not be.
-
-    Numbers that only moved within what they were uncertain by stay as the user wrote them.
-    """
-    if not corrected.effects:
+    """The user's file with what MuJoCo holds natively put in, and what could not be."""
+    moved = bool(np.any(np.asarray(corrected.change)))
+    if not (corrected.effects or moved):
         return source.text, ()
-    native = corrected.as_written.native
-    moved = any(hasattr(e, "standard_change") for e in corrected.effects)
+    native = corrected.native
+    moved = moved or any(hasattr(e, "standard_change") for e in corrected.effects)
     warnings: list[str] = []
     names = ("armature", "damping", "frictionloss", "stiffness", "springref")
     values = tuple(

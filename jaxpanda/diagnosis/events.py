@@ -11,6 +11,7 @@ from ..effects import AbstractEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import TorqueRipple
 from ..effects.load import EVER, PayloadChange
+from ..effects.unknown import UnknownAt
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes, log_mean_exp
 from .host import parallel
 from .problem import Problem
@@ -19,6 +20,8 @@ BIN = 0.1
 """Resolution of the scan over time [s]."""
 _WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135)
 _EDGE = 3
+_SPOTS, _PLACES = (0.03, 0.08), 64
+"""Widths of a torque at one place [rad], and how many places are tried at most."""
 _SLOWEST = 5.0
 """Least order of a ripple [1/rad]."""
 
@@ -79,6 +82,42 @@ def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]
             float(score[top]),
             deviation[top] * scale[top],
             (0.4 * step / orders[top],),
+        )
+
+    return [p for p in parallel(one, joints) if p is not None]
+
+
+def spots(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]) -> list[Proposal]:
+    """For each of these joints the likeliest place on its way at which a torque is alone."""
+
+    def one(j: int) -> Proposal | None:
+        q = [t.motion.q[:, j] for t in problem.traces]
+        low, high = np.quantile(np.concatenate(q), (0.005, 0.995))
+        widths = [max(w, (high - low) / _PLACES) for w in _SPOTS]
+        effects = [UnknownAt(j, float(at), w) for w in widths for at in np.arange(low + w, high - w, w)]
+        if not effects:
+            return None
+        place, width = (np.array([getattr(e, name) for e in effects]) for name in ("place", "width"))
+
+        def columns() -> list[np.ndarray]:
+            out = []
+            for trace, on in zip(problem.traces, problem.active, strict=True):
+                x = (trace.motion.q[:, j, None] - place) / width
+                sign = np.tanh(trace.motion.qd[:, j, None] / effects[0].v0)
+                bump = np.exp(-0.5 * x**2) * on
+                out.append(np.stack([bump, x * bump, sign * bump], 2))
+            return out
+
+        b, G = problem.projected("spots", columns, noise, design, j)
+        deviation = np.full((len(effects), 3), noise.std[j] * np.sqrt(2))
+        score, scale = log_bayes(b, G, deviation, SCALES)
+        top = int(score.argmax())
+        return Proposal(
+            effects[top],
+            float(log_mean_exp(score)),
+            float(score[top]),
+            deviation[top] * scale[top],
+            (0.4 * float(width[top]), 0.3),
         )
 
     return [p for p in parallel(one, joints) if p is not None]

@@ -26,6 +26,8 @@ Knowledge = Literal["exact", "identified", "rough", "unknown"]
 _SAMPLES = 1500
 """Samples, taken as independent, of the identification that "identified" supposes."""
 _FRICTION = {"exact": 0.0, "identified": 0.02, "rough": 0.2, "unknown": 10.0}
+_TURNED = 0.5
+"""Deviation of the share of known friction that turns over each of some speeds."""
 _SHAKEN = 0.5
 """Deviation of the share of an acceleration that is noise."""
 _UNKNOWN = 1e3
@@ -75,7 +77,8 @@ def _rough(arm: Arm) -> Float[np.ndarray, "standard n"]:
 def nuisance(
     traces: Sequence[Trace], spread: Float[np.ndarray, "standard n"], knowledge: Knowledge
 ) -> list[Float[np.ndarray, "_time dof _n"]]:
-    """The columns N of each recording; the last of them noise of the encoders, which no knowledge takes away."""
+    """The columns N of each recording; the last of them how known friction turns and noise of the
+    encoders, which no knowledge takes away."""
     arm = traces[0].motion.arm
     share = _FRICTION[knowledge]
     damping, level = share * np.asarray(arm.damping), share * np.asarray(arm.frictionloss)
@@ -88,7 +91,7 @@ def nuisance(
         sign = trace.down(trace.sign)
         for j in np.flatnonzero(level > 0):
             parts.append((level[j] * sign)[:, :, None] * joints[:, j : j + 1])
-        out.append(np.concatenate([*parts, _SHAKEN * trace.shaken], 2))
+        out.append(np.concatenate([*parts, _TURNED * trace.turning, _SHAKEN * trace.shaken], 2))
     return out
 
 

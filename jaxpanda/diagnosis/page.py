@@ -231,7 +231,7 @@ def _short(name: str, most: int = 40) -> str:
 
 def _of(effect: AbstractEffect) -> str:
     """What a free form is a function of."""
-    form = getattr(effect, "form", "")
+    form = getattr(effect, "form", "of q")
     return {
         "odd in dq": "velocity",
         "even in dq": "velocity",

@@ -49,6 +49,12 @@ class Premises:
     """What the healthy recordings show; its columns, each times its deviation, end the nuisance."""
     notes: tuple[str, ...] = ()
 
+    def changes(
+        self, x: Float[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, "dof 10"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
+        """What coefficients of the nuisance change: standard parameters, damping and frictionloss."""
+        return knowledge_.changes(self.problem.arm, x, self.spread, self.knowledge)
+
 
 def pose(
     traces: tuple[Trace, ...],

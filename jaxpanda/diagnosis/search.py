@@ -15,8 +15,8 @@ from ..effects.drive import Backlash, JointElasticity, TorqueRipple
 from ..effects.effect import AbstractDryFriction
 from ..effects.friction import AsymmetricFriction
 from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
-from ..effects.unknown import Unknown
-from .events import BIN, Proposal, ripple, slowest, windows
+from ..effects.unknown import Unknown, UnknownOfTwo
+from .events import BIN, Proposal, ripple, slowest, spots, windows
 from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
 from .host import parallel
 from .library import Candidates, form_of
@@ -45,6 +45,8 @@ OPPOSED = 20.0
 """How many times the torque of a law its parts may be."""
 UNKNOWN_MARGIN, UNKNOWN_SHARE = 10.0, 0.06
 """What a free form must win by [nats, share]."""
+TWO_JOINTS = 1.1
+"""How many times the evidence of any form of one channel a form of two joints' positions must have."""
 USUAL = {
     "asymmetric_friction": -3.0,
     "stribeck_friction": -3.0,
@@ -308,7 +310,7 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
     out = []
     for i, term in enumerate(state.terms):
         where = energy[i].sum(1) / total[i]
-        if isinstance(term.effect, Unknown):
+        if isinstance(term.effect, Unknown | UnknownOfTwo):
             where[int(term.effect.source)] = 1.0
         once = term.effect.bound_to_recording
         rows = energy[i].any(0) if once else np.ones(energy.shape[2], bool)
@@ -392,7 +394,7 @@ def contest(problem: Problem, state: State, say: Any) -> State:
         design = problem.design(others, state.noise)
         gained = state.design.log_evidence - design.log_evidence
         at_joint = [c for c in problem.catchalls if c.joint == joint]
-        forms = grids(problem, design, state.noise, at_joint)
+        forms = free_forms(problem, design, state.noise, at_joint)
         if any(isinstance(t.effect, TorqueRipple) for t in here):
             forms += slow_ripple(problem, design, state.noise, joint)
         best = max(forms, key=lambda p: p.best)
@@ -554,7 +556,7 @@ def ranked(
     here = [g for g in problem.library if g.joint is None or g.joint in where]
     free = [g for g in problem.catchalls if g.joint in where]
     scanned = [
-        *(handicapped(p) for p in grids(problem, design, noise, free)),
+        *(handicapped(p) for p in free_forms(problem, design, noise, free)),
         *grids(problem, design, noise, here),
         *ripple(problem, design, noise, where),
         *(windows(problem, design, noise) if len(where) > 1 or joints is None or before else ()),
@@ -671,6 +673,24 @@ def grids(problem: Problem, design: Design, noise: Noise, groups: Sequence[Candi
             )
         )
     return out
+
+
+def free_forms(
+    problem: Problem, design: Design, noise: Noise, groups: Sequence[Candidates]
+) -> list[Proposal]:
+    """For each joint the likeliest free form: of two joints' positions only where it says much more than any of
+    one channel, since it fits a little of everything."""
+    of_one, of_two = (
+        [g for g in groups if isinstance(g.effects[0], UnknownOfTwo) is two] for two in (False, True)
+    )
+    found = {p.key: p for p in grids(problem, design, noise, of_one)}
+    for p in spots(problem, design, noise, sorted({g.joint for g in groups if g.joint is not None})):
+        if p.key not in found or p.evidence > found[p.key].evidence:
+            found[p.key] = p
+    for p in grids(problem, design, noise, of_two):
+        if p.key not in found or p.best > TWO_JOINTS * max(found[p.key].best, 0.0):
+            found[p.key] = p
+    return list(found.values())
 
 
 def first_steps(effect: AbstractEffect) -> tuple[float, ...]:

@@ -9,7 +9,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractInstantEffect, Coefficient, Resistance, sign_over_velocity, smooth_sign
+from .effect import (
+    AbstractDryFriction,
+    AbstractInstantEffect,
+    Coefficient,
+    Resistance,
+    Shape,
+    sign_over_velocity,
+    smooth_sign,
+)
 from .motion import Channels, Joint
 
 _WIDTH = 0.01
@@ -123,4 +131,92 @@ class Unknown(AbstractInstantEffect):
         return super().parameters(c, covariance) + knots
 
 
-EFFECTS = (Unknown,)
+class UnknownOfTwo(AbstractInstantEffect):
+    r"""A torque that two joints' positions decide: $\tau_j = \sum_{m+n \le 3} c_{mn} P_m(u) P_n(v)$.
+
+    u and v are the positions of the joint and of the other, from -1 to 1 between the ends of what was recorded
+    and constant beyond; P are Legendre's polynomials. A cable or a hose led past both joints gives such a torque.
+    """
+
+    name: ClassVar[str] = "unknown"
+    repeats: ClassVar[bool] = True
+    reveals: ClassVar[str] = Unknown.reveals
+
+    joint: Joint
+    source: Joint
+    low: Float[Array, "2"] | tuple[float, float]
+    """Of both positions [rad]."""
+    high: Float[Array, "2"] | tuple[float, float]
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["UnknownOfTwo"]:
+        return []
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"polynomial_{m}_{n}", "N·m") for m, n in _POWERS)
+
+    @property
+    def equation(self) -> str:
+        j, k = int(self.joint) + 1, int(self.source) + 1
+        return f"tau = f(q_{j}, q_{k}), a polynomial of third degree: a function of two joints' positions"
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        x = jnp.stack([s.q[self.joint], s.q[self.source]])
+        low, high = jnp.asarray(self.low), jnp.asarray(self.high)
+        u, v = jnp.clip(2 * (x - low) / (high - low) - 1, -1.0, 1.0)
+        legendre = lambda y: (jnp.ones_like(y), y, 1.5 * y * y - 0.5, (2.5 * y * y - 1.5) * y)
+        of_u, of_v = legendre(u), legendre(v)
+        return jnp.stack([of_u[m] * of_v[n] for m, n in _POWERS])
+
+
+_POWERS = tuple((m, n) for m in range(4) for n in range(4 - m))
+
+
+class UnknownAt(AbstractDryFriction):
+    r"""A torque at one place on a joint's way: a notch, a magnet, a worn tooth or a tight spot.
+
+    $$\tau_j = \left(a + b\,x + c \tanh(\dot q_j/v_0)\right) e^{-x^2/2}, \qquad x = (q_j - q_0)/w$$
+    """
+
+    name: ClassVar[str] = "unknown"
+    repeats: ClassVar[bool] = True
+    shapes: ClassVar[tuple[Shape, ...]] = (
+        Shape("place", "rad", -np.inf, np.inf, logarithmic=False),
+        Shape("width", "rad", 0.01, 0.3),
+    )
+    reveals: ClassVar[str] = "slow motions of the joint past the place, in both directions"
+
+    joint: Joint
+    place: Float[Array, ""] | float
+    width: Float[Array, ""] | float
+    v0: Float[Array, ""] | float = _WIDTH
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["UnknownAt"]:
+        return []  # the search scans the places
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(name, "N·m") for name in ("level", "slope", "friction"))
+
+    @property
+    def equation(self) -> str:
+        return (
+            "tau = (level + slope * x + friction * sign(dq)) * exp(-x^2 / 2), x = (q - place) / width: "
+            "a torque at one place of the joint's way"
+        )
+
+    def levels(self, s: Channels) -> Float[Array, " n"]:
+        return jnp.stack([0.0, 0.0, 1.0]) * self._bump(s)[1]
+
+    def remainder(self, s: Channels) -> Float[Array, " n"]:
+        x, bump = self._bump(s)
+        return jnp.stack([1.0, x, 0.0]) * bump
+
+    def _bump(self, s: Channels) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        x = (s.q[self.joint] - self.place) / self.width
+        return x, jnp.exp(-0.5 * x * x)
+
+
+EFFECTS = (Unknown, UnknownOfTwo, UnknownAt)
