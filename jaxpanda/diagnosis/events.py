@@ -94,10 +94,12 @@ def spots(problem: Problem, design: Design, noise: Noise, joints: Iterable[int])
         q = [t.motion.q[:, j] for t in problem.traces]
         low, high = np.quantile(np.concatenate(q), (0.005, 0.995))
         widths = [max(w, (high - low) / _PLACES) for w in _SPOTS]
-        effects = [UnknownAt(j, float(at), w) for w in widths for at in np.arange(low + w, high - w, w)]
+        effects = [
+            UnknownAt(j, place=float(at), width=w) for w in widths for at in np.arange(low + w, high - w, w)
+        ]
         if not effects:
             return None
-        place, width = (np.array([getattr(e, name) for e in effects]) for name in ("place", "width"))
+        place, width = (np.array([float(getattr(e, name)) for e in effects]) for name in ("place", "width"))
 
         def columns() -> list[np.ndarray]:
             out = []
