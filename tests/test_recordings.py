@@ -138,6 +138,12 @@ def _scaled(columns: slice, factor: float):
     return change
 
 
+def _wrapped(cells: list[list[str]]) -> str:
+    for row in cells[1:]:
+        row[1] = repr((float(row[1]) + 2.68 + np.pi) % (2 * np.pi) - np.pi)
+    return text(cells)
+
+
 BAD = {
     "not a number": (_cell(7, 2, "nan"), r"column q_2, row 7 \(line 8\): the value is nan"),
     "infinite": (_cell(9, 5, "inf"), r"column tau_1, row 9 \(line 10\): the value is inf"),
@@ -161,6 +167,10 @@ BAD = {
     "time repeated": (_cell(30, 0, "0.28"), r"column time, row 30 \(line 31\): time repeats"),
     "time going back": (_cell(30, 0, "0.1"), r"column time, row 30 \(line 31\): time goes back"),
     "degrees": (_scaled(slice(1, 5), 180 / np.pi), "looks like degrees"),
+    "a wrapped angle": (
+        _wrapped,
+        r"column q_1, row \d+ \(line \d+\): the angle jumps by a turn.*numpy.unwrap",
+    ),
     "degrees per second": (_scaled(slice(3, 5), 180 / np.pi), "dq looks like degrees per second"),
     "milliseconds": (_scaled(slice(0, 1), 1e3), "looks like milliseconds.*divide it by 1000"),
     "microseconds": (_scaled(slice(0, 1), 1e6), "looks like microseconds"),
@@ -179,6 +189,35 @@ def test_bad_csv_is_refused_in_one_sentence_that_names_the_place(tmp_path, name)
         load(tmp_path / "bad.csv")
     assert str(raised.value).startswith("bad.csv: ")
     assert "\n" not in str(raised.value)
+
+
+def _turning(factor: float, others: float) -> Recording:
+    """A joint that turns on at 2.2 rad/s beside two that swing by half a radian, in a unit of that many."""
+    made = recording(samples=1500)
+    q = made.q * others
+    q[:, 2] += 2.2 * made.time
+    return Recording("made", made.time, factor * q, None, made.tau)
+
+
+def test_a_joint_that_turns_on_and_on_is_no_degrees(tmp_path):
+    """Went wrong: 33 rad of a continuous joint were refused as degrees."""
+    save(_turning(1.0, 1.0), tmp_path / "on.csv")
+    assert np.ptp(load(tmp_path / "on.csv").q[:, 2]) > 30
+
+
+@pytest.mark.parametrize("recording", [_turning(180 / np.pi, 1.0), _turning(1.0, 0.1), _turning(1.0, 40.0)])
+def test_a_joint_that_goes_as_far_beside_others_that_are_still_or_far_too_is_degrees(tmp_path, recording):
+    save(recording, tmp_path / "degrees.csv")
+    with pytest.raises(InputError, match=r"looks like degrees.*take whole turns off it"):
+        load(tmp_path / "degrees.csv")
+
+
+def test_a_gap_in_which_a_joint_turns_on_is_no_jump(tmp_path):
+    made = _turning(1.0, 1.0)
+    keep = (made.time < 5) | (made.time > 5 + 2 * np.pi / 2.2)
+    cut = Recording("cut", made.time[keep], made.q[keep], None, None)
+    save(cut, tmp_path / "cut.csv")
+    assert same(load(tmp_path / "cut.csv"), cut)
 
 
 def test_line_numbers_count_blank_lines(tmp_path):

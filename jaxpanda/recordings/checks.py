@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Bool
 
 from ..errors import InputError
 from .glitches import without_glitches
@@ -14,6 +15,14 @@ SHORTEST = 0.25
 """Nothing can be said about a motion shorter than this [s]."""
 _MARGIN = 1.1  # on `RATES`: a nominal 50 Hz log may run at 48
 _TURN = 2 * np.pi
+_WRAPS = 0.5
+"""How far from a whole turn the jump of a wrapped angle is [rad]: what the joint turns from row to row."""
+_LEAPS = 30.0
+"""Speed beyond which it is a jump, where rows are missing [rad/s]."""
+_TRAVELS = 0.5
+"""How far a joint moves that says which unit positions are in [rad]."""
+_FASTEST = 10.0
+"""Speed that a joint which turns on reaches at most [rad/s]."""
 
 
 def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Recording:
@@ -32,6 +41,7 @@ def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Re
     _ordered(recording, row)
     _rate(recording)
     _long_enough(recording)
+    _unwrapped(recording, row)
     recording = without_glitches(recording)
     _radians(recording)
     _velocity_unit(recording)
@@ -101,17 +111,47 @@ def _long_enough(recording: Recording) -> None:
         )
 
 
-def _radians(recording: Recording) -> None:
-    """Joints turn a few times at most: two joints beyond two turns, or one beyond four, are degrees."""
-    furthest = np.max(np.abs(recording.q), axis=0)
-    if np.sum(furthest > 2 * _TURN) >= 2 or np.any(furthest > 4 * _TURN):
-        j = int(np.argmax(furthest))
-        row = int(np.argmax(np.abs(recording.q[:, j])))
+def _unwrapped(recording: Recording, row: Callable[[int], str]) -> None:
+    """No joint turns by a whole turn between two rows."""
+    step, elapsed = np.diff(recording.q, axis=0), np.diff(recording.time)[:, None]
+    jumps = (np.abs(np.abs(step) - _TURN) < _WRAPS) & (np.abs(step) > _LEAPS * elapsed)
+    if jumps.any():
+        j = int(np.argmax(jumps.any(0)))
+        i = int(np.argmax(jumps[:, j])) + 1
+        before, after = recording.q[i - 1, j], recording.q[i, j]
         raise InputError(
-            f"{recording.name}: column q_{j + 1} reaches {recording.q[row, j]:g} at {recording.time[row]:g} "
-            "s, which looks like degrees where radians are needed: multiply positions (and velocities) by "
-            "pi/180"
+            f"{recording.name}: column q_{j + 1}, {row(i)}: the angle jumps by a turn ({before:.4g} rad, then "
+            f"{after:.4g} rad; {int(jumps.sum())} such jumps in all), where positions must be continuous: unwrap "
+            "them, as numpy.unwrap(q, axis=0) does"
         )
+
+
+def _radians(recording: Recording) -> None:
+    """Joints turn a few times at most: two joints beyond two turns, or one beyond four, are degrees.
+
+    Unless all others stay within a turn, move about there, and nothing is fast: of numbers in degrees few are so
+    small. That dq agrees with q says nothing, as both may be in degrees.
+    """
+    furthest = np.max(np.abs(recording.q), axis=0)
+    far = furthest > 2 * _TURN
+    if (np.sum(far) < 2 and not np.any(furthest > 4 * _TURN)) or _turns_on(recording, far):
+        return
+    j = int(np.argmax(furthest))
+    row = int(np.argmax(np.abs(recording.q[:, j])))
+    raise InputError(
+        f"{recording.name}: column q_{j + 1} reaches {recording.q[row, j]:g} at {recording.time[row]:g} "
+        "s, which looks like degrees where radians are needed: multiply positions (and velocities) by "
+        "pi/180; if they are radians of a joint that turns on, take whole turns off it, or cut the recording"
+    )
+
+
+def _turns_on(recording: Recording, far: Bool[np.ndarray, " dof"]) -> bool:
+    """Whether the joints that go far turn on, beside others that move as joints do in radians."""
+    near, apart = recording.q[:, ~far], max(1, round(0.1 * recording.rate))
+    elapsed = (recording.time[apart:] - recording.time[:-apart])[:, None]
+    speed = np.abs(recording.q[apart:] - recording.q[:-apart]) / elapsed
+    moves = np.any(np.ptp(near, axis=0) > _TRAVELS) and np.all(np.abs(near) < _TURN)
+    return bool(moves and np.all(speed < _FASTEST))
 
 
 def _velocity_unit(recording: Recording) -> None:
