@@ -12,7 +12,7 @@ from jaxpanda.diagnosis.decide import MISLEADS, UNLIKELY, WANDERS, findings, unn
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.next_motion import next_motion
 from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.search import ACCEPT, SHADOW, floors, grids, handicapped, start, with_terms
+from jaxpanda.diagnosis.search import ACCEPT, SHADOW, floors, grids, handicapped, refine, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.drive import JointSpring
@@ -62,6 +62,24 @@ def test_a_spring_that_stiffens_is_a_spring_wherever_the_joint_moves():
     assert isinstance(spring.effect, JointSpring)
     assert (spring.effect.form, spring.effect.joint) == ("cubic", 3)
     assert spring.evidence > max(handicapped(p).evidence for p in free)
+
+
+def test_a_strong_linear_spring_far_from_zero_does_not_stiffen():
+    """The prior held the torque that cancels at zero unlikely, so that it came out cubic: MuJoCo has none."""
+    pull = lambda t, q, qd, qdd: np.eye(7)[3] * (60.0 * (q[:, [3]] + 1.5))
+    problem = posed(record(5, pull), record(6, pull))
+    state = start(problem)
+    library = [g for g in problem.library if (g.name, g.joint) == ("joint_spring", 3)]
+    (spring,) = grids(problem, state.design, state.noise, library)
+    spring = refine(problem, state.design, state.noise, spring)
+    assert isinstance(spring.effect, JointSpring)
+    assert spring.effect.form == "linear"
+    c = with_terms(problem, [problem.term(spring.effect, spring.deviation)]).design.x[-2:]
+    native = spring.effect.mjcf(c, Arm.panda())
+    assert native["stiffness"][3] == pytest.approx(60.0, rel=0.01)
+    assert native["springref"][3] == pytest.approx(-1.5, abs=0.01)
+    told = {p["name"]: p["value"] for p in spring.effect.parameters(c, np.zeros((2, 2)))}
+    assert told["torque_at_zero"] == pytest.approx(90.0, rel=0.01)
 
 
 @pytest.mark.slow

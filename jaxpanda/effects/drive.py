@@ -60,9 +60,10 @@ class JointSpring(AbstractInstantEffect):
 
     Form "cubic" adds $k_2 x^2 + k_3 x^3$: a spring that stiffens away from where it rests. There $x = q - $
     `around`, which changes no torque: about zero a joint that moves far from it would need coefficients that
-    cancel, and no prior has those. Form "centred" is without b. Form "slack" pulls on one side of where it gets
-    taut, or harder there than on the other: $\tau_j = k_+ w s(x/w) - k_- w s(-x/w) + b$ with
-    $s(y) = \log(1 + e^y)$ and the width w over which it tightens.
+    cancel, and no prior has those. Form "linear" takes x for q where it comes from a cubic one, so that only what
+    stiffens is weighed. Form "centred" is without b. Form "slack" pulls on one side of where it gets taut, or
+    harder there than on the other: $\tau_j = k_+ w s(x/w) - k_- w s(-x/w) + b$ with $s(y) = \log(1 + e^y)$ and
+    the width w over which it tightens.
     """
 
     name: ClassVar[str] = "joint_spring"
@@ -89,11 +90,12 @@ class JointSpring(AbstractInstantEffect):
         return out
 
     def variants(self, arm: Arm) -> Sequence["JointSpring"]:
-        """A spring that is found to stiffen may be slack on one side."""
+        """A spring that is found to stiffen may be slack on one side, or not stiffen at all."""
         if self.form != "cubic":
             return []
         low, high = (float(np.clip(x[self.joint], -np.pi, np.pi)) for x in (arm.lower, arm.upper))
-        return [JointSpring(self.joint, "slack", low + x * (high - low), 0.1) for x in np.linspace(0, 1, 15)]
+        slack = [JointSpring(self.joint, "slack", low + x * (high - low), 0.1) for x in np.linspace(0, 1, 15)]
+        return [dataclasses.replace(self, form="linear"), *slack]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -123,19 +125,27 @@ class JointSpring(AbstractInstantEffect):
             }[self.form]
         )
 
+    def parameters(self, c, covariance) -> list[dict[str, Any]]:
+        """A linear spring's about zero, wherever it was fitted from."""
+        if self.form != "linear":
+            return super().parameters(c, covariance)
+        about_zero = np.array([[1.0, 0.0], [-float(self.around), 1.0]])
+        return super().parameters(about_zero @ c, about_zero @ covariance @ about_zero.T)
+
     def at(self, s: Channels) -> Float[Array, " n"]:
         q = s.q[self.joint]
         x, one = q - self.around, jnp.ones_like(q)
         if self.form == "slack":
             pulled = [side * self.width * jax.nn.softplus(side * x / self.width) for side in (1.0, -1.0)]
             return jnp.stack([*pulled, one])
-        return jnp.stack({"linear": [q, one], "centred": [q], "cubic": [x, one, x**2, x**3]}[self.form])
+        return jnp.stack({"linear": [x, one], "centred": [q], "cubic": [x, one, x**2, x**3]}[self.form])
 
     def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         if self.form in ("cubic", "slack") or arm.stiffness[int(self.joint)] != 0:
             return {}
         j = int(self.joint)
-        return {"stiffness": {j: c[0]}, "springref": {j: -c[1] / c[0] if self.form == "linear" else 0.0}}
+        rest = self.around - c[1] / c[0] if self.form == "linear" else 0.0
+        return {"stiffness": {j: c[0]}, "springref": {j: rest}}
 
 
 class TorqueRipple(AbstractInstantEffect):
