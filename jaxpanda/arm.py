@@ -1,5 +1,6 @@
 """`Arm`: a serial arm with names, units, limits and the physics its model already holds."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import equinox as eqx
@@ -59,6 +60,11 @@ class Arm(eqx.Module):
     def dof(self) -> int:
         return self.chain.dof
 
+    def unit(self, turning: str, joint: int | None = None) -> str:
+        """`unit_of` one joint, or of all."""
+        prismatic = self.chain.prismatic if joint is None else self.chain.prismatic[joint : joint + 1]
+        return unit_of(turning, prismatic.tolist())
+
     def known_torque(
         self, q: Float[Array, " dof"], qd: Float[Array, " dof"], qdd: Float[Array, " dof"]
     ) -> Float[Array, " dof"]:
@@ -78,3 +84,17 @@ class Arm(eqx.Module):
     ) -> Float[Array, " dof"]:
         """Joint torque [N m] of a motion under the model as it is."""
         return rnea(self.chain, self.standard, q, qd, qdd) + self.known_torque(q, qd, qdd)
+
+
+def unit_of(turning: str, prismatic: Iterable[bool]) -> str:
+    """The unit that a number has at joints, some of which may slide, given the one that it has where they turn.
+
+    m for rad, N for N·m, kg for kg·m²; "N·m or N" for joints of both kinds.
+    """
+    slides = set(prismatic)
+    sliding = turning
+    for old, new in (("(N·m)", "N"), ("N·m", "N"), ("N m", "N"), ("kg·m²", "kg"), ("rad", "m")):
+        sliding = sliding.replace(old, new)
+    if slides == {False, True} and sliding != turning:
+        return f"{turning} or {sliding}"
+    return sliding if True in slides else turning

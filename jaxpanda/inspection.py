@@ -9,7 +9,7 @@ import numpy as np
 from jaxpanda_kernels import regressor
 from jaxtyping import Float, Int
 
-from .arm import Arm
+from .arm import Arm, unit_of
 from .errors import require_x64
 from .recordings import Recording
 from .recordings.checks import velocity_scale
@@ -27,6 +27,8 @@ class JointInspection:
     """One joint's motion and sensors; None where it cannot be told."""
 
     joint: int
+    slides: bool
+    """By the model; False without one. Where it slides, rad is m and N m is N."""
     lower: float
     """Least position [rad]."""
     upper: float
@@ -110,10 +112,23 @@ class Inspection:
         """Plain numbers, lists and strings."""
         return {"schema": "jaxpanda.inspection/1", **dataclasses.asdict(self)}
 
+    def unit(self, turning: str) -> str:
+        """`unit_of` the joints."""
+        return unit_of(turning, [joint.slides for joint in self.joints])
+
     def table(self) -> tuple[list[str], list[list[str]]]:
         """Heads and rows of a table with a row for each joint."""
-        heads = ["joint", "range rad", "speed rad/s", "acceleration rad/s²", "reversals", "rest %"]
-        heads += ["dq late ms", "step N m", "noise N m", "repeat noise N m", "torque scale", "gravity scale"]
+        rad, speed, acceleration, force = map(self.unit, ("rad", "rad/s", "rad/s²", "N m"))
+        heads = ["joint", f"range {rad}", f"speed {speed}", f"acceleration {acceleration}"]
+        heads += [
+            "reversals",
+            "rest %",
+            "dq late ms",
+            f"step {force}",
+            f"noise {force}",
+            f"repeat noise {force}",
+        ]
+        heads += ["torque scale", "gravity scale"]
         rows = [
             [
                 str(joint.joint),
@@ -176,7 +191,10 @@ def inspect(recording: Recording, arm: Arm | None = None) -> Inspection:
     duration = float(recording.time[-1] - recording.time[0])
     signals = prepare(recording, cutoff=min(5.0, 0.2 * recording.rate), trim=min(0.6, duration / 5))
     model = None if arm is None else _states(arm, signals)
-    joints = tuple(_joint(j, recording, signals, model) for j in range(recording.dof))
+    joints = tuple(
+        _joint(j, recording, signals, model, arm is not None and bool(arm.chain.prismatic[j]))
+        for j in range(recording.dof)
+    )
     identifiable = None if arm is None or model is None else _identifiable(arm, signals, joints, model)
     steps = np.diff(recording.time)
     long = np.flatnonzero(steps > LONGEST_GAP)
@@ -206,7 +224,9 @@ def inspect(recording: Recording, arm: Arm | None = None) -> Inspection:
     return dataclasses.replace(inspection, verdicts=tuple(verdicts + _motion_verdicts(inspection)))
 
 
-def _joint(j: int, recording: Recording, signals: Signals, model: _States | None) -> JointInspection:
+def _joint(
+    j: int, recording: Recording, signals: Signals, model: _States | None, slides: bool
+) -> JointInspection:
     """What one joint's channels say."""
     inner = slice(signals.keep[0], signals.keep[-1] + 1)
     qd, qdd = signals.qd[inner, j], signals.qdd[inner, j]
@@ -215,6 +235,7 @@ def _joint(j: int, recording: Recording, signals: Signals, model: _States | None
     torque_scale, gravity_scale = (None, None) if model is None or tau is None else _scales(j, signals, model)
     return JointInspection(
         joint=j + 1,
+        slides=slides,
         lower=float(recording.q[:, j].min()),
         upper=float(recording.q[:, j].max()),
         speed=float(np.abs(qd).max()),
@@ -376,13 +397,13 @@ def _unit_verdicts(found: Inspection, arm: Arm | None) -> list[str]:
     said = [f"time in s: {found.rate:.4g} Hz is a usual rate"]
     furthest = max(max(abs(joint.lower), abs(joint.upper)) for joint in found.joints)
     if furthest <= 2 * np.pi:
-        said.append(f"q in rad: no joint beyond {furthest:.2f}")
+        said.append(f"q in {found.unit('rad')}: no joint beyond {furthest:.2f}")
     else:
         said.append(
             f"q reaches {furthest:.2f}, more than a turn: rad if a joint turns on, else check for degrees"
         )
     if found.velocity_scale is not None:
-        said.append(f"dq in rad/s: {found.velocity_scale:.3f} times d(q)/dt")
+        said.append(f"dq in {found.unit('rad/s')}: {found.velocity_scale:.3f} times d(q)/dt")
     lags = [joint.velocity_lag for joint in found.joints if joint.velocity_lag is not None]
     if lags and abs(np.median(lags)) > 2e-3:
         said.append(f"dq is {1e3 * np.median(lags):.1f} ms late behind d(q)/dt: velocities are taken from q")
@@ -391,7 +412,8 @@ def _unit_verdicts(found: Inspection, arm: Arm | None) -> list[str]:
         for joint, low, high in zip(found.joints, lower, upper, strict=True):
             if joint.lower < low - 0.05 or joint.upper > high + 0.05:
                 said.append(
-                    f"joint {joint.joint} goes from {joint.lower:.2f} to {joint.upper:.2f} rad, beyond the "
+                    f"joint {joint.joint} goes from {joint.lower:.2f} to {joint.upper:.2f} "
+                    f"{unit_of('rad', [joint.slides])}, beyond the "
                     f"model's limits {low:.2f} to {high:.2f}: check the model, the joints' order and zeros"
                 )
     return said
@@ -415,8 +437,8 @@ def _torque_verdicts(found: Inspection, arm: Arm | None) -> list[str]:
     median = float(np.median(np.abs(list(scales.values()))))
     if not 0.5 < median < 2:
         said.append(
-            f"torque is {median:.3g} times what the model needs: check its unit (N m at the joint) and the "
-            "model"
+            f"torque is {median:.3g} times what the model needs: check its unit "
+            f"({found.unit('N m')} at the joint) and the model"
         )
     odd = [joint for joint, k in scales.items() if k > 0 and not 0.5 < k / median < 2]
     if odd:
@@ -426,7 +448,7 @@ def _torque_verdicts(found: Inspection, arm: Arm | None) -> list[str]:
         )
     if not reversed_ and 0.5 < median < 2 and not odd:
         said.append(
-            f"torque in N m, positive along the joint axis: {min(scales.values()):.2f} to "
+            f"torque in {found.unit('N m')}, positive along the joint axis: {min(scales.values()):.2f} to "
             f"{max(scales.values()):.2f} times the model's"
         )
     if gravity:

@@ -177,17 +177,19 @@ def validation(checked: Any) -> Sequence[Section]:
 def diagnosis(found: Any) -> Sequence[Section]:
     """Verdict, each finding with its numbers, and the fit before and after; the page has more."""
     document = found.to_json()
-    names = found.corrected.arm.joint_names
-    errors = by_joint("Torque error in the band of the diagnosis [N m]", names, fit_columns(document["fit"]))
+    names, force = found.corrected.arm.joint_names, found.corrected.arm.unit("N m")
+    errors = by_joint(
+        f"Torque error in the band of the diagnosis [{force}]", names, fit_columns(document["fit"])
+    )
     sections = [Section("Verdict", found.lines(), [errors])]
-    sections += [_finding(i, one, names) for i, one in enumerate(document["findings"])]
+    sections += [_finding(i, one, names, force) for i, one in enumerate(document["findings"])]
     notes = [*document["notes"]]
     if document["next_experiment"] is not None:
         notes.append(f"{document['next_experiment']['file']} holds the motion that would decide.")
     return [*sections, Section("Notes", notes)] if notes else sections
 
 
-def _finding(place: int, one: Mapping[str, Any], names: Sequence[str]) -> Section:
+def _finding(place: int, one: Mapping[str, Any], names: Sequence[str], force: str) -> Section:
     sentences = [one["summary"], f"Equation: {one['equation']}", f"Confidence: {one['confidence']:.2f}."]
     if one["intervals"]:
         spans = ", ".join(f"{a:.2f} to {b:.2f} s" for a, b in one["intervals"])
@@ -200,7 +202,7 @@ def _finding(place: int, one: Mapping[str, Any], names: Sequence[str]) -> Sectio
         for p in one["parameters"]
     ]
     tables = [Table(["parameter", "joint", "value", "std", "unit"], rows)] if rows else []
-    tables.append(by_joint("Torque that it explains, rms [N m]", names, {"rms": one["rms_torque"]}))
+    tables.append(by_joint(f"Torque that it explains, rms [{force}]", names, {"rms": one["rms_torque"]}))
     return Section(f"{place + 1}. {one['effect'].replace('_', ' ')}", sentences, tables)
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import numpy as np
 import pytest
 from helpers import record
@@ -138,6 +139,19 @@ def test_what_each_recording_shows_otherwise_is_not_explained():
     assert any("predicted no better" in note for note in found.notes)
     assert found.verdict in ("partly_explained", "unexplained")
     assert all(f.confidence <= WANDERS for f in found.findings if f.effect != "unknown")
+
+
+def test_what_acts_along_a_joint_that_slides_is_told_in_newtons_and_metres():
+    """A scale of N m/rad and rms torque in N m were told of a SCARA's lift."""
+    panda = Arm.panda()
+    arm = eqx.tree_at(lambda a: a.chain.prismatic, panda, panda.chain.prismatic.at[6].set(True))
+    rubs = lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) >= 5)
+    problem = pose((prepare(record(7, rubs, arm=arm), arm),), (True,), "exact").problem
+    terms = [problem.term(e, np.ones(1)) for e in (CoulombFriction(5, 0.01), CoulombFriction(6, 0.01))]
+    (both,) = findings(problem, with_terms(problem, terms), [False, False])
+    assert [p["unit"] for p in both.parameters] == ["N·m", "rad/s", "N", "m/s"]
+    (slides,) = findings(problem, with_terms(problem, terms[1:]), [False])
+    assert " N rms" in slides.summary
 
 
 def test_several_laws_of_which_none_is_likely_are_one_unknown():

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -112,6 +113,21 @@ def test_every_effect_reads_back_from_its_json_and_says_its_parameters(arm, moti
             assert {"name", "joint", "value", "std", "unit"} == set(parameter)
             assert 0 <= parameter["std"] < np.inf
         assert effect.equation
+
+
+def test_units_go_by_whether_the_joint_slides_where_the_number_is_in_its_coordinate(arm):
+    slides = eqx.tree_at(lambda a: a.chain.prismatic, arm, arm.chain.prismatic.at[2].set(True))
+    spring = JointSpring(2, "linear")
+    for turning, sliding in (
+        ("N·m/rad", "N/m"),
+        ("rad/(N·m)", "m/N"),
+        ("N·m·s/rad", "N·s/m"),
+        ("kg·m²", "kg"),
+    ):
+        assert spring.unit(turning, arm) == JointSpring(1, "linear").unit(turning, slides) == turning
+        assert spring.unit(turning, slides) == sliding
+        assert Payload(2).unit(turning, slides) == turning
+    assert (slides.unit("N·m"), slides.unit("s"), arm.unit("N·m")) == ("N·m or N", "s", "N·m")
 
 
 def test_every_shape_of_a_grid_lies_within_its_bounds(arm):

@@ -1,5 +1,6 @@
 import json
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +39,15 @@ def virtual(q=excitation, *, late: float = 0.0, noise: float = 0.02, rate: float
 
 def said(found: Inspection) -> str:
     return "\n".join(found.verdicts)
+
+
+def test_a_joint_that_slides_is_told_in_metres():
+    arm = panda()
+    assert inspect(virtual(), arm).table()[0][1] == "range rad"
+    arm = eqx.tree_at(lambda a: a.chain.prismatic, arm, arm.chain.prismatic.at[6].set(True))
+    found = inspect(virtual(), arm)
+    assert [joint.slides for joint in found.joints] == [False] * 6 + [True]
+    assert found.table()[0][1] == "range rad or m"
 
 
 def test_a_clean_recording_is_found_right_in_every_respect():

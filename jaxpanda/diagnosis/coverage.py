@@ -306,5 +306,6 @@ def _least(
         shown = share[m, k] > 1e-6 and raw[m, k] > 0
         c = float(np.sqrt(delta / left[m, k])) if shown else None
         rms = None if c is None else float(c * size[m, k])
-        out.append(Least(effect.name, joint, name, c, coefficient.unit, rms, float(share[m, k])))
+        told = effect.unit(coefficient.unit, problem.arm)
+        out.append(Least(effect.name, joint, name, c, told, rms, float(share[m, k])))
     return out

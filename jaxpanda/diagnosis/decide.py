@@ -158,6 +158,7 @@ def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Findi
     rms = np.sqrt(np.mean(np.concatenate(felt) ** 2, 0))
     stand_ins = sorted({f.effect.replace("_", " ") for f in doubtful if f.effect != "unknown"})
     strongest = int(np.argmax(rms))
+    size = f"{rms[strongest]:.3g} {problem.arm.unit('N·m', strongest)} rms"
     one = Finding(
         effect="unknown",
         joints=tuple(sorted({j for f in doubtful for j in f.joints})),
@@ -169,8 +170,8 @@ def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Findi
         parameters=(),
         rms_torque=rms,
         evidence=sum(f.evidence for f in doubtful),
-        summary=f"Joint {strongest + 1} shows {rms[strongest]:.3g} N·m rms that no named effect explains; in its"
-        f" place the model has what fits best, none of it likely: {', '.join(stand_ins)}.",
+        summary=f"Joint {strongest + 1} shows {size} that no named effect explains; in its place the model has"
+        f" what fits best, none of it likely: {', '.join(stand_ins)}.",
         terms=terms,
     )
     return [*(f for f in found if all(f is not d for d in doubtful)), one]
@@ -316,7 +317,8 @@ def _finding(
     rms = np.sqrt(np.mean(felt**2, 0)) if len(felt) else np.zeros(problem.dof)
     parameters, equations = [], []
     for i, term in zip(members, terms, strict=True):
-        parameters += term.effect.parameters(coefficients(state, i), covariance[i])
+        told = term.effect.parameters(coefficients(state, i), covariance[i])
+        parameters += [{**p, "unit": term.effect.unit(p["unit"], problem.arm)} for p in told]
         if term.effect.equation not in equations:
             equations.append(term.effect.equation)
     named = [i for i in members if called(state.terms[i].effect) == name] or list(members)
@@ -356,9 +358,10 @@ def _intervals(problem: Problem, terms: Sequence[Term]) -> tuple[tuple[float, fl
 def _summary(name, joints, rms, intervals, recordings, alternatives, problem, own, equation) -> str:
     """One or two plain sentences."""
     strongest = int(np.argmax(rms))
+    size = f"{rms[strongest]:.3g} {problem.arm.unit('N·m', strongest)} rms"
     if name == "unknown":
         return (
-            f"Joint {strongest + 1} shows {rms[strongest]:.3g} N·m rms that no named effect explains; it is"
+            f"Joint {strongest + 1} shows {size} that no named effect explains; it is"
             f" fitted as a free curve ({equation.split(': ')[-1]})."
         )
     where = "" if len(joints) in (0, problem.dof) else f" at joint{'s' * (len(joints) > 1)} {_listed(joints)}"
@@ -366,7 +369,7 @@ def _summary(name, joints, rms, intervals, recordings, alternatives, problem, ow
     if intervals is not None:
         when = " in " + recordings[0] + " from " + ", ".join(f"{a:.2f} s to {b:.2f} s" for a, b in intervals)
     text = (
-        f"The simulation is missing {name.replace('_', ' ')}{where}{when}: up to {rms[strongest]:.3g} N·m rms,"
+        f"The simulation is missing {name.replace('_', ' ')}{where}{when}: up to {size},"
         f" at joint {strongest + 1}."
     )
     if alternatives and own < 0.9:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import summaries
+from ..arm import Arm
 from ..effects import CATALOGUE, AbstractEffect
 from ..report import Figure, Listing, Section, Table, number
 from .decide import coefficients
@@ -51,7 +52,7 @@ def sections(found: Diagnosis) -> list[Section]:
     names = found.corrected.arm.joint_names
     out = [_verdict(found, document, names)]
     out += [_finding(found, i, one, names) for i, one in enumerate(found.findings)]
-    out.append(_held_out(found, names))
+    out.append(_held_out(found))
     if found.replays:
         out.append(_replays(found, names))
     if found.next_motion is not None:
@@ -76,7 +77,9 @@ def _verdict(found: Diagnosis, document: Mapping[str, Any], names: Sequence[str]
             f" {found.next_motion.kind}."
         )
     columns = summaries.fit_columns(document["fit"])
-    table = summaries.by_joint("Torque error in the band of the diagnosis, rms [N·m]", names, columns)
+    table = summaries.by_joint(
+        f"Torque error in the band of the diagnosis, rms [{found.problem.arm.unit('N·m')}]", names, columns
+    )
     floor = np.maximum(np.asarray(columns["noise floor"]), 1e-12)
     shades: list[list[float | None]] = []
     for j in range(len(names)):
@@ -116,7 +119,7 @@ def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -
     if rows:
         tables.append(Table(["parameter", "joint", "value", "95 % interval", "unit"], rows))
     felt = ["rms", *(number(float(v), 3) for v in one.rms_torque)]
-    tables.append(Table(["", *names], [felt], "Torque that it explains [N·m]"))
+    tables.append(Table(["", *names], [felt], f"Torque that it explains [{found.problem.arm.unit('N·m')}]"))
     if one.alternatives:
         reveals = {c.name: c.reveals for c in CATALOGUE}
         rows = [[_plain(name), f"{p:.2f}", reveals.get(name, "")] for name, p in one.alternatives]
@@ -153,6 +156,7 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
     for i in one.terms:  # the term that acts where most is felt
         if joint in state.terms[i].effect.joints:
             effect = state.terms[i].effect
+    force = problem.arm.unit("N·m", joint)
     own = [
         sum((t.columns[r] @ coefficients(state, i) for i, t in _terms(found, one)), np.zeros_like(residual))
         for r, residual in enumerate(problem.residual)
@@ -186,7 +190,7 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
                 problem, problem.design((), state.noise), state.noise, joint
             )
             left.vlines(orders, 0, amplitude, color=_AFTER, linewidth=0.8)
-            left.set(xlabel="order: periods in a turn of the joint", ylabel="amplitude [N·m]")
+            left.set(xlabel="order: periods in a turn of the joint", ylabel=f"amplitude [{force}]")
             left.set_title("order spectrum of the residual")
         elif hums is not None:
             tau = np.asarray(trace.signals.tau)[:, joint]
@@ -194,12 +198,14 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
             left.semilogy(frequencies, sines(tau), color=_AFTER, linewidth=0.8)
             left.axvline(hums, color=_FIT, linewidth=0.8, linestyle=":")
             left.set(
-                xlabel="frequency [Hz]", ylabel="amplitude [N·m]", xlim=(0, min(3 * hums, frequencies[-1]))
+                xlabel="frequency [Hz]",
+                ylabel=f"amplitude [{force}]",
+                xlim=(0, min(3 * hums, frequencies[-1])),
             )
             left.set_title("spectrum of the measured torque")
         else:
             _draw_regime(left, xs, y, f)
-            left.set(xlabel=label, ylabel=f"residual of {names[joint]} [N·m]")
+            left.set(xlabel=label, ylabel=f"residual of {names[joint]} [{force}]")
             left.set_title("what is left without this finding, and its law")
         time = trace.motion.time[rows[shown]]
         _trail(right, time, lefts[shown], color="0.6", label="residual without this finding")
@@ -207,7 +213,7 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
             _trail(right, time, fits[shown], color=_FIT, label="what it explains")
         for a, b in one.intervals or ():
             right.axvspan(a, b, color=_BEFORE, alpha=0.15, linewidth=0)
-        right.set(xlabel=f"time in {_short(trace.name)} [s]", ylabel="[N·m]")
+        right.set(xlabel=f"time in {_short(trace.name)} [s]", ylabel=f"[{force}]")
         right.set_title(f"{names[joint]} over time")
         right.legend(loc="upper right", fontsize=7)
 
@@ -247,28 +253,43 @@ def _of(effect: AbstractEffect) -> str:
 
 def _regime(found: Diagnosis, effect: AbstractEffect | None, joint: int, against: str):
     """A label, the variable in each recording, and by which sign the residual is turned."""
-    traces = found.problem.traces
+    traces, unit = found.problem.traces, found.problem.arm.unit
     source = int(getattr(effect, "source", joint))
     what = against.split(",")[0]
     label, part = {
-        "velocity": (f"velocity of joint {joint + 1} [rad/s]", lambda t: t.motion.qd[:, joint]),
-        "position": (f"position of joint {joint + 1} [rad]", lambda t: t.motion.q[:, joint]),
-        "acceleration": (f"acceleration of joint {joint + 1} [rad/s²]", lambda t: t.motion.qdd[:, joint]),
-        "load": (f"load on joint {joint + 1} [N·m]", lambda t: t.motion.load[:, joint]),
-        "|load|": (f"size of the load on joint {joint + 1} [N·m]", lambda t: np.abs(t.motion.load[:, joint])),
+        "velocity": (
+            f"velocity of joint {joint + 1} [{unit('rad/s', joint)}]",
+            lambda t: t.motion.qd[:, joint],
+        ),
+        "position": (f"position of joint {joint + 1} [{unit('rad', joint)}]", lambda t: t.motion.q[:, joint]),
+        "acceleration": (
+            f"acceleration of joint {joint + 1} [{unit('rad/s²', joint)}]",
+            lambda t: t.motion.qdd[:, joint],
+        ),
+        "load": (f"load on joint {joint + 1} [{unit('N·m', joint)}]", lambda t: t.motion.load[:, joint]),
+        "|load|": (
+            f"size of the load on joint {joint + 1} [{unit('N·m', joint)}]",
+            lambda t: np.abs(t.motion.load[:, joint]),
+        ),
         "model torque": (
-            f"torque of the model at joint {joint + 1} [N·m]",
+            f"torque of the model at joint {joint + 1} [{unit('N·m', joint)}]",
             lambda t: t.motion.torque[:, joint],
         ),
         "source torque": (
-            f"torque of the model at joint {source + 1} [N·m]",
+            f"torque of the model at joint {source + 1} [{unit('N·m', source)}]",
             lambda t: t.motion.torque[:, source],
         ),
-        "source position": (f"position of joint {source + 1} [rad]", lambda t: t.motion.q[:, source]),
-        "source velocity": (f"velocity of joint {source + 1} [rad/s]", lambda t: t.motion.qd[:, source]),
-        "first joint": ("position of joint 1 [rad]", lambda t: t.motion.q[:, 0]),
+        "source position": (
+            f"position of joint {source + 1} [{unit('rad', source)}]",
+            lambda t: t.motion.q[:, source],
+        ),
+        "source velocity": (
+            f"velocity of joint {source + 1} [{unit('rad/s', source)}]",
+            lambda t: t.motion.qd[:, source],
+        ),
+        "first joint": (f"position of joint 1 [{unit('rad', 0)}]", lambda t: t.motion.q[:, 0]),
         "reversal": (
-            "distance since the last reversal [rad]",
+            f"distance since the last reversal [{unit('rad', joint)}]",
             lambda t: np.where(since_reversal(t, joint) > 0.2, np.nan, since_reversal(t, joint)),
         ),
         "time": ("time [s]", lambda t: t.motion.time),
@@ -331,14 +352,14 @@ def _trail(axis: Any, time: Float[np.ndarray, " time"], y: Float[np.ndarray, " t
     axis.plot(clock.ravel(), np.stack([blocks.min(1), blocks.max(1)], 1).ravel(), **style)
 
 
-def _held_out(found: Diagnosis, names: Sequence[str]) -> Section:
-    figures = []
+def _held_out(found: Diagnosis) -> Section:
+    figures, arm = [], found.problem.arm
     rows = zip(found.problem.traces, found.problem.active, found.residuals(), found.held_out, strict=True)
     for trace, on, (name, time, before, _), (after, counts) in rows:
         if len(figures) == 2 or not on:
             continue
         figures.append(
-            _curves(name, time, before, np.where(counts[:, None], after, np.nan), names, trace.weight)
+            _curves(arm, name, time, before, np.where(counts[:, None], after, np.nan), trace.weight)
         )
     sentences = [
         "What is left of the measured torque: by your simulation, and by the corrected one, whose coefficients"
@@ -351,13 +372,15 @@ def _held_out(found: Diagnosis, names: Sequence[str]) -> Section:
 
 
 def _curves(
+    arm: Arm,
     name: str,
     time: Float[np.ndarray, " time"],
     before: Float[np.ndarray, "time dof"],
     after: Float[np.ndarray, "time dof"],
-    names: Sequence[str],
     weight: Float[np.ndarray, " time"],
 ) -> Figure:
+    names = arm.joint_names
+
     def draw(canvas: Any) -> None:
         axes = canvas.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
         room = 1.05 * len(names)
@@ -367,7 +390,7 @@ def _curves(
                 axis, time, np.where(weight > 0, before[:, j], np.nan), color=_BEFORE, label="your simulation"
             )
             _trail(axis, time, after[:, j], color=_AFTER, label="corrected, held out")
-            axis.set_ylabel(f"{_short(names[j], 14)}\n[N·m]")
+            axis.set_ylabel(f"{_short(names[j], 14)}\n[{arm.unit('N·m', j)}]")
             axis.locator_params(axis="y", nbins=4)
         axes[0].legend(loc="upper right", ncols=2, fontsize=7)
         axes[-1].set_xlabel("time [s]")
@@ -376,10 +399,10 @@ def _curves(
 
 
 def _replays(found: Diagnosis, names: Sequence[str]) -> Section:
-    tables = []
+    tables, rad = [], found.problem.arm.unit("rad")
     for one in found.replays:
         columns = {
-            f"{what.replace('_', ' ').replace('rmse rad', 'tracking [rad]')}, {when}": one.get(
+            f"{what.replace('_', ' ').replace('rmse rad', f'tracking [{rad}]')}, {when}": one.get(
                 f"{what}_{when}"
             )
             for what in ("rmse_rad", "feedback_rms")
@@ -416,7 +439,7 @@ def _next(found: Diagnosis, names: Sequence[str]) -> Section:
         canvas.subplots_adjust(left=0.06, right=0.995, bottom=0.18, top=0.97)
         for j, name in enumerate(names):
             _trail(axis, motion.time, motion.q[:, j], label=name)
-        axis.set(xlabel="time [s]", ylabel="[rad]")
+        axis.set(xlabel="time [s]", ylabel=f"[{found.problem.arm.unit('rad')}]")
         axis.legend(ncols=len(names), fontsize=7, loc="upper right")
 
     return Section(
@@ -456,7 +479,7 @@ def _where(found: Diagnosis, names: Sequence[str]) -> Section:
                 names[o.joint],
                 when,
                 f"order {number(o.order, 3)}",
-                f"{number(o.amplitude, 2)} N·m",
+                f"{number(o.amplitude, 2)} {found.problem.arm.unit('N·m', o.joint)}",
                 _chance(o.p),
             ]
             for o in one.orders
@@ -552,12 +575,13 @@ def _gain(value: float) -> str:
 
 
 def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
-    rows, shades = [], []
+    rows, shades, arm = [], [], found.problem.arm
     for effect in dict.fromkeys(one.effect for one in found.least_shown):
         cells = {one.joint: one for one in found.least_shown if one.effect == effect}
         first = next(iter(cells.values()))
         whole = cells.get(None)
-        row = [f"{_plain(effect)}\n{first.parameter} [{first.unit}]"]
+        units = " or ".join(dict.fromkeys(one.unit for one in cells.values()))
+        row = [f"{_plain(effect)}\n{first.parameter} [{units}]"]
         shade: list[float | None] = [None]
         for j in range(len(names)):
             one = whole if whole is not None else cells.get(j)
@@ -568,7 +592,7 @@ def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
             row.append(
                 "not seen"
                 if one.size is None or one.rms_torque is None
-                else f"{number(one.size, 2)}\n{number(one.rms_torque, 2)} N·m"
+                else f"{number(one.size, 2)}\n{number(one.rms_torque, 2)} {arm.unit('N·m', one.joint)}"
             )
             shade.append(-0.5 if one.size is None else -0.35 * (one.survives < 0.05) or None)
         rows.append(row)
@@ -619,6 +643,7 @@ def _file(found: Diagnosis) -> Section:
 
 def _method(found: Diagnosis, names: Sequence[str]) -> Section:
     problem, noise = found.problem, found.state.noise
+    force = problem.arm.unit("N·m")
     localised = found.localisation[1]
     trace = problem.traces[0]
     rates = sorted({round(1 / t.motion.dt) for t in problem.traces})
@@ -639,8 +664,8 @@ def _method(found: Diagnosis, names: Sequence[str]) -> Section:
         "Noise beside everything found: autoregressive of order 3",
         names,
         {
-            "deviation [N·m]": noise.std,
-            "innovations [N·m]": noise.sigma,
+            f"deviation [{force}]": noise.std,
+            f"innovations [{force}]": noise.sigma,
             **{f"a{k + 1}": noise.a[:, k] for k in range(noise.a.shape[1])},
             f"samples that count, of {localised.samples}": localised.effective_samples,
         },

@@ -143,6 +143,10 @@ class AbstractEffect(eqx.Module):
             )
         return out
 
+    def unit(self, turning: str, arm: Arm) -> str:
+        """Unit of one of its numbers; of those in a joint's coordinate, by whether the joint slides."""
+        return arm.unit(turning, self.joints[0]) if hasattr(self, "joint") else turning
+
     def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         """Changes that reproduce the effect in MuJoCo natively, by joint attribute; empty if none can."""
         return {}
