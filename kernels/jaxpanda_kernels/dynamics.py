@@ -24,6 +24,9 @@ def _outward(
 
     `a` is the acceleration of the frame's origin less gravity, so that a resting body carries its weight.
     """
+    for name, x in (("q", q), ("qd", qd), ("qdd", qdd)):
+        if x.shape != (chain.dof,):
+            raise ValueError(f"{name} has shape {x.shape}, where this chain needs {(chain.dof,)}: one sample")
     z = jnp.array([0, 0, 1], q.dtype)
 
     def step(carry, joint):
@@ -57,6 +60,8 @@ def rnea(
         Luh, Walker, Paul, "On-Line Computational Scheme for Mechanical Manipulators", 1980.
     """
     E, r, w, dw, a = _outward(chain, q, qd, qdd)
+    if phi.shape != (chain.dof, 10):
+        raise ValueError(f"phi has shape {phi.shape}, where this chain needs {(chain.dof, 10)}")
 
     def inward(carry, link):
         f_c, n_c = carry

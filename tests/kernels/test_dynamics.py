@@ -278,6 +278,16 @@ def test_both_modes_of_differentiation_agree_with_finite_differences(mixed):
     assert_allclose(forward, difference, rtol=1e-6)
 
 
+def test_a_sample_of_another_arm_is_refused_with_both_shapes():
+    """`scan` spoke of leading axis sizes."""
+    q, qd, qdd = (x[0] for x in states(0, 1, 7))
+    for dynamics in (rnea, jax.jit(rnea)):
+        with pytest.raises(ValueError, match=r"q has shape \(7,\), where this chain needs \(4,\)"):
+            dynamics(random_chain(0, 4), random_bodies(0, 7), q, qd, qdd)
+    with pytest.raises(ValueError, match=r"q has shape \(7,\)"):
+        regressor(random_chain(0, 4), q, qd, qdd)
+
+
 def test_many_chains_and_many_samples_at_once():
     chains = [random_chain(seed, 3) for seed in range(3)]
     bodies = jnp.stack([random_bodies(seed, 3) for seed in range(3)])
