@@ -117,6 +117,16 @@ def test_late_torque_shows_as_a_lag(posed):
     assert found.lag == pytest.approx(0.012, abs=4 * found.std)
 
 
+def test_what_no_lag_explains_has_none_with_a_deviation(posed):
+    """A strong spring was told as torque late by 100 ms, give or take 5000 s."""
+
+    def planted(r, motion, tau):
+        tau[:, 3] += np.interp(motion.time - 0.25, motion.time, motion.torque[:, 3]) - motion.torque[:, 3]
+
+    found = found_in(with_noise(posed, 3, planted)).lags[3]
+    assert (found.beyond, found.lag, found.std) == (True, pytest.approx(0.1), None)
+
+
 def test_a_push_shows_as_two_change_points_in_its_recording(posed):
     def planted(r, motion, tau):
         tau[:, 5] += 0.3 * ((motion.time > 4) & (motion.time < 6)) * r

@@ -96,7 +96,8 @@ class Lag:
     joint: int
     lag: float
     """[s]"""
-    std: float
+    std: float | None
+    """None where the likeliest lies beyond the lags that were tried, of which `lag` is the last."""
     p: float
     beyond: bool
 
@@ -397,9 +398,12 @@ def lag_profile(
 
 
 def _lag(problem: Problem, design: Design, noise: Noise, joint: int) -> Lag:
-    """The likeliest lag, by a parabola through the best of the profile."""
+    """The likeliest lag, by a parabola through the best of the profile where that is inside."""
     lags, gain = lag_profile(problem, design, noise, joint)
-    k = int(np.clip(gain.argmax(), 1, len(lags) - 2))
+    k = int(gain.argmax())
+    if k in (0, len(lags) - 1):
+        p = float(scipy.stats.chi2.sf(max(2 * float(gain[k]), 0.0), 1))
+        return Lag(joint, float(lags[k]), None, p, p < ALARM / problem.dof)
     step = lags[1] - lags[0]
     bend = gain[k - 1] - 2 * gain[k] + gain[k + 1]
     slope = 0.5 * (gain[k + 1] - gain[k - 1])

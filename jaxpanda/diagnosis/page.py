@@ -490,7 +490,9 @@ def _where(found: Diagnosis, names: Sequence[str]) -> Section:
                 names[lag.joint],
                 when,
                 "torque late",
-                f"{1e3 * lag.lag:.1f} ± {1e3 * lag.std:.1f} ms",
+                f"{1e3 * lag.lag:.1f} ± {1e3 * lag.std:.1f} ms"
+                if lag.std is not None
+                else f"no best lag within {1e3 * abs(lag.lag):.0f} ms",
                 _chance(lag.p),
             ]
             for lag in one.lags
