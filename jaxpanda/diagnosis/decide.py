@@ -153,6 +153,7 @@ def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Findi
         if p >= _LISTED:
             likely[name] = max(p, likely.get(name, 0.0))
     doubtful += [f for f in found if f.effect == "unknown"]
+    alternatives = sorted(likely.items(), key=lambda pair: -pair[1])[:4]
     terms = tuple(i for f in doubtful for i in f.terms)
     felt = [x for x, on in zip(torque(state, *terms), problem.active, strict=True) if on]
     rms = np.sqrt(np.mean(np.concatenate(felt) ** 2, 0))
@@ -164,8 +165,8 @@ def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Findi
         joints=tuple(sorted({j for f in doubtful for j in f.joints})),
         recordings=tuple(dict.fromkeys(name for f in doubtful for name in f.recordings)),
         intervals=None,
-        confidence=1.0 - max(likely.values(), default=0.005),
-        alternatives=tuple(sorted(likely.items(), key=lambda pair: -pair[1])[:4]),
+        confidence=1.0 - (sum(p for _, p in alternatives) or 0.005),
+        alternatives=tuple(alternatives),
         equation="; ".join(dict.fromkeys(f.equation for f in doubtful)),
         parameters=(),
         rms_torque=rms,
@@ -325,10 +326,12 @@ def _finding(
     clearest = max(named, key=lambda i: rivals[i][0])
     sure = 1.0 if name == "unknown" else float(doubt[clearest])
     own = sure * rivals[clearest][2]
+    same = (name, called(state.terms[clearest].effect))
     alternatives = sorted(
-        ((n, sure * p) for n, p in rivals[clearest][1].items() if n != name and sure * p >= _LISTED),
+        ((n, sure * p) for n, p in rivals[clearest][1].items() if n not in same and sure * p >= _LISTED),
         key=lambda pair: -pair[1],
     )
+    summary = _summary(name, joints, rms, intervals, names, alternatives, problem, own, "; ".join(equations))
     return Finding(
         effect=name,
         joints=joints,
@@ -340,9 +343,7 @@ def _finding(
         parameters=tuple(parameters),
         rms_torque=rms,
         evidence=float(sum(rivals[i][0] for i in members)),
-        summary=_summary(
-            name, joints, rms, intervals, names, alternatives, problem, own, "; ".join(equations)
-        ),
+        summary=summary,
         terms=tuple(members),
     )
 
