@@ -7,6 +7,7 @@ the tool does against an independent simulator is shown under `experiments/`.
 import dataclasses
 import json
 import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +15,11 @@ import numpy as np
 import pytest
 from helpers import NOISE, excitation, record
 
-from jaxpanda import Arm, InputError, Recording
+from jaxpanda import Arm, InputError, Recording, markup
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
 from jaxpanda.diagnosis.decide import titles
+from jaxpanda.diagnosis.diagnosis import _corrected_xml
 from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check, inertial_spread
@@ -42,6 +44,7 @@ from jaxpanda.effects.friction import CoulombFriction, FrictionDrift, StribeckFr
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.export import panda_mjcf
+from jaxpanda.mjcf import from_document
 from jaxpanda.report import to_html
 
 
@@ -246,6 +249,28 @@ def test_recordings_of_any_rate_come_on_two_grids_that_belong_together(rate):
 def test_friction_over_a_hair_s_breadth_is_coulomb_s():
     assert called(PreslidingHysteresis(2, 0.0008, "dahl whole")) == "coulomb_friction"
     assert called(PreslidingHysteresis(2, 0.003, "dahl whole")) == "presliding_hysteresis"
+
+
+def _with(*effects):
+    """The Panda's file with presliding friction of 0.2 and 0.1 N m put in, and what it cannot hold."""
+    arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", Path("panda.xml")))
+    zeros = jnp.zeros(7)
+    c = tuple(jnp.array([0.2, 0.1]) for _ in effects)
+    return _corrected_xml(source, Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, effects, c))
+
+
+def test_friction_that_sticks_is_mujoco_s_frictionloss():
+    """It was named Coulomb's, and corrected.xml had nothing of it."""
+    whole, extra = (PreslidingHysteresis(2, 4e-4, f"dahl {extent}") for extent in ("whole", "extra"))
+    text, notes = _with(whole)
+    assert 'frictionloss="0.3"' in text.replace("0.30000000000000004", "0.3")
+    assert notes == ()
+    assert _with(extra) == (panda_mjcf(), ())
+
+
+def test_what_the_file_cannot_hold_is_said_once():
+    _, notes = _with(*(PreslidingHysteresis(j, 0.01, "dahl whole") for j in (1, 2, 4)))
+    assert len(notes) == 1
 
 
 def test_coulomb_s_friction_belongs_to_the_richer_law_at_its_joint():

@@ -12,6 +12,7 @@ from ..effects.contact import ExternalContact
 from ..effects.drive import Backlash, JointElasticity
 from ..effects.friction import CoulombFriction, StribeckFriction, ViscousFriction
 from ..effects.load import InertialParameters, PayloadChange
+from ..effects.memory import PreslidingHysteresis
 from ..effects.sensing import TorqueGain
 from .finding import Finding, joined
 from .problem import Problem, Term
@@ -332,6 +333,8 @@ def _finding(
         key=lambda pair: -pair[1],
     )
     summary = _summary(name, joints, rms, intervals, names, alternatives, problem, own, "; ".join(equations))
+    if name == CoulombFriction.name and any(isinstance(t.effect, PreslidingHysteresis) for t in terms):
+        summary += " Its equation has it stick at rest, as MuJoCo's frictionloss does."
     return Finding(
         effect=name,
         joints=joints,

@@ -405,7 +405,8 @@ def _corrected_xml(source: MjcfSource, corrected: Corrected) -> tuple[str, tuple
             text = export_mjcf(text, {("option", ""): {"gravity": value}})
         except InputError as error:
             warnings.append(f"corrected.xml: gravity should be {value}: {error}")
-    warnings += [f"corrected.xml cannot hold {e.name}: {e.equation}" for e, _ in corrected.beyond]
+    beyond = [f"corrected.xml cannot hold {e.name}: {e.equation}" for e, _ in corrected.beyond]
+    warnings += dict.fromkeys(beyond)  # once, however many joints it is at
     return text, (*warnings, *result.warnings)
 
 

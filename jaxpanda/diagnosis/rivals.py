@@ -28,14 +28,11 @@ HOLDS = {
 """Effects of which others are special cases; whoever sees as much of either takes the special one."""
 SPECIAL = 2.0
 """By how much, as a logarithm: what richer laws pay for in evidence, the temperature takes from them."""
-STICKS = 1.5e-3
-"""Breakaway distance below which friction with memory is Coulomb's that sticks [rad]: a joint at rest holds any
-load up to the level, which a sign of the velocity cannot say."""
 
 
 def called(effect: AbstractEffect) -> str:
     """The name of what an effect is: friction that builds up over a hair's breadth is Coulomb's, and sticks."""
-    if isinstance(effect, PreslidingHysteresis) and float(effect.breakaway_distance) < STICKS:
+    if isinstance(effect, PreslidingHysteresis) and effect.sticks:
         return CoulombFriction.name
     return effect.name
 

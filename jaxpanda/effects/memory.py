@@ -1,7 +1,7 @@
 """Friction with memory around reversals, and the backlash of a gear."""
 
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from ..arm import Arm
 from .effect import (
     AbstractMemoryEffect,
     Coefficient,
+    Numbers,
     Resistance,
     Seconds,
     Shape,
@@ -18,6 +19,10 @@ from .effect import (
     smooth_sign,
 )
 from .motion import Channels, Joint
+
+STICKS = 1.5e-3
+"""Breakaway distance below which friction with memory is Coulomb's that sticks [rad]: a joint at rest holds any
+load up to the level, which a sign of the velocity cannot say."""
 
 
 class PreslidingHysteresis(AbstractMemoryEffect):
@@ -75,6 +80,18 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         if self._law == "lugre":
             torque += " + micro_damping * (dq - z * |dq|)"
         return f"tau = {torque}, {law}"
+
+    @property
+    def sticks(self) -> bool:
+        """Whether it is Coulomb's friction, which holds a joint at rest."""
+        return float(self.breakaway_distance) < STICKS
+
+    def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
+        """MuJoCo's `frictionloss` holds a joint at rest too; where a form "... extra" is found, it is there."""
+        if not self.sticks:
+            return {}
+        level = {"only": c[0], "extra": 0.0 * c[0], "whole": c[0] + c[-1]}[self._extent]
+        return {"frictionloss": {int(self.joint): level}}
 
     def start(self, s: Channels) -> Float[Array, " states"]:
         return smooth_sign(s.qd[self.joint], 0.01)[None]
