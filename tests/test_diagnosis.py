@@ -224,7 +224,7 @@ def test_a_model_whose_own_numbers_are_wrong_is_not_consistent(gain, rub, named,
     result.save(tmp_path / "out")
     error = predict(tmp_path / "out", made[0]) - made[0].tau
     before = result.fit.held_out_rmse_before
-    assert np.all(np.sqrt(np.mean(error[80:-80] ** 2, 0)) < 0.3 * before)
+    assert np.all(np.sqrt(np.mean(error[80:-80] ** 2, 0)) < np.maximum(0.3 * before, 0.003))
 
 
 def test_what_the_healthy_arm_shows_already_is_not_reported():
