@@ -84,41 +84,44 @@ class ExportResult:
             InputError: an included file of that name stands there with another content.
         """
         path = Path(path)
-        included = {path.parent / name: text for name, text in self.document.texts.items() if name}
-        for file, text in included.items():
-            if file.exists() and file.read_bytes() != text.encode():
-                raise InputError(
-                    f"{file}: is included and would be overwritten; write {path.name} into another folder"
-                )
-        for file, text in included.items():
-            if not file.exists():
-                write_text(file, text)
-        write_text(path, self.text)
+        write_document(self.document, path)
         write_text(path.with_name(f"{path.stem}.jaxpanda.json"), to_json(self.sidecar))
-        return _missing_assets(self.document, path.parent)
+        return missing_assets(self.document, path.parent)
 
 
-def export_mjcf(
-    source: str | Path | markup.Document, changes: Mapping[tuple[str, str], Mapping[str, str | None]]
-) -> str:
-    """The file's text with attributes changed, every other byte as it was.
+def write_document(document: markup.Document, path: Path) -> None:
+    """Write a file and what it includes.
+
+    Raises:
+        InputError: an included file of that name stands there with another content; nothing is written.
+    """
+    included = {path.parent / name: text for name, text in document.texts.items() if name}
+    for file, text in included.items():
+        if file.exists() and file.read_bytes() != text.encode():
+            raise InputError(
+                f"{file}: is included and would be overwritten; write {path.name} into another folder"
+            )
+    for file, text in included.items():
+        if not file.exists():
+            write_text(file, text)
+    write_text(path, document.text)
+
+
+def edit_mjcf(
+    document: markup.Document, changes: Mapping[tuple[str, str], Mapping[str, str | None]]
+) -> markup.Document:
+    """The file with attributes changed, every other byte as it was.
 
     Args:
-        source: path, or text (what starts with '<').
+        document: the file.
         changes: attributes by (tag, name) of their element; None takes an attribute away. An `inertial` goes
             by the name of its body, an element without a name by ''.
 
     Raises:
         InputError: no such element in the file itself, or more than one.
     """
-    if isinstance(source, markup.Document):
-        document = source
-    elif isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<"):
-        document = markup.parse(source, "mujoco", Path("model.xml"))
-    else:
-        document = markup.read(source, "mujoco")
     edits = [markup.Edit(_find(document, tag, name), values) for (tag, name), values in changes.items()]
-    return markup.edit(document, edits).text
+    return markup.edit(document, edits)
 
 
 def _find(document: markup.Document, tag: str, name: str) -> markup.Element:
@@ -479,7 +482,7 @@ def read_sidecar(path: str | Path) -> dict[str, Any]:
     return document
 
 
-def _missing_assets(document: markup.Document, folder: Path) -> tuple[str, ...]:
+def missing_assets(document: markup.Document, folder: Path) -> tuple[str, ...]:
     """A warning for the files that the model names and that are not where it will look from `folder`."""
     compiler = {k: v for e in document.root.walk() if e.tag == "compiler" for k, v in e.attributes.items()}
     shared = compiler.get("assetdir", "")
@@ -487,6 +490,7 @@ def _missing_assets(document: markup.Document, folder: Path) -> tuple[str, ...]:
         "mesh": compiler.get("meshdir", shared),
         "hfield": compiler.get("meshdir", shared),
         "texture": compiler.get("texturedir", shared),
+        "model": "",
     }
     files = [
         Path(place[e.tag], e.attributes["file"])
@@ -497,8 +501,8 @@ def _missing_assets(document: markup.Document, folder: Path) -> tuple[str, ...]:
     if not missing:
         return ()
     return (
-        f"{len(missing)} meshes or textures ({missing[0]}, ...) lie beside {document.path} and not beside the"
-        " file written: write it there, or copy them",
+        f"{len(missing)} meshes, textures or attached models ({missing[0]}, ...) lie beside {document.path}"
+        " and not beside the file written: write it there, or copy them",
     )
 
 

@@ -1,13 +1,19 @@
 """The commands: what they leave, what they print, and how they refuse."""
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import equinox as eqx
+import jax
 import numpy as np
 import pytest
+from helpers import excitation
 
+import jaxpanda
 from jaxpanda.__main__ import main
 from jaxpanda.recordings import save
 from jaxpanda.recordings.recording import Recording
@@ -22,6 +28,17 @@ def recording(tmp_path_factory) -> Path:
     log = record(seed=3, duration=4.0).recording
     save(log, path)
     return path
+
+
+MODELS = Path(__file__).parent / "models"
+
+
+def shaken(arm, extra=None, seconds: float = 8.0) -> Recording:
+    """A motion of every joint of an arm, with a little noise on its torque; `extra(qd)` is added to that."""
+    rng, t = np.random.default_rng(0), np.arange(int(200 * seconds)) / 200
+    q, qd, qdd = excitation(eqx.tree_at(lambda a: (a.lower, a.upper), arm, 2 * (np.zeros(arm.dof),)), t, 0)
+    tau = np.asarray(jax.vmap(arm.inverse_dynamics)(q, qd, qdd)) + 0.05 * rng.normal(size=q.shape)
+    return Recording("shaken.csv", t, q, qd, tau if extra is None else tau + extra(qd))
 
 
 def refused(capsys, *arguments: str) -> str:
@@ -48,8 +65,6 @@ def test_help_needs_no_jax():
 
 
 def test_every_public_name_resolves():
-    import jaxpanda
-
     for name in dir(jaxpanda):
         assert getattr(jaxpanda, name) is not None
     with pytest.raises(AttributeError, match="identify"):
@@ -159,3 +174,30 @@ def test_a_recording_of_another_arm_is_refused(capsys, tmp_path):
     line = refused(capsys, "identify", "--recording", str(other), "--out", str(tmp_path / "run"))
     assert "six.csv" in line
     assert "6 joints" in line
+
+
+def test_the_corrected_file_loads_though_the_user_s_includes_others(capsys, tmp_path):
+    """A finding in such a model ended in "panda.xml: includes 'parts/defaults.xml', which cannot be read"."""
+    shutil.copytree(MODELS, tmp_path / "in")
+    model, out = tmp_path / "in" / "including.xml", tmp_path / "out"
+    text = model.read_text().replace(
+        '<geom name="floor"', '<geom type="mesh" mesh="hall"/>\n    <geom name="floor"'
+    )
+    model.write_text(text.replace("<worldbody>", '<asset><mesh file="hall.obj"/></asset>\n  <worldbody>'))
+    (tmp_path / "in" / "hall.obj").write_text("")
+    defaults = tmp_path / "in" / "parts" / "defaults.xml"
+    defaults.write_text(re.sub(r' frictionloss="[\d.]+"', "", defaults.read_text()))
+    arm, log = jaxpanda.Arm.from_mjcf(model), tmp_path / "log.csv"
+    save(shaken(arm, lambda qd: 3 * qd * [0, 1, 0]), log)
+    assert (
+        main(["diagnose", "--model", str(model), "--recording", str(log), "--out", str(out), "--json"]) == 0
+    )
+    said = json.loads(capsys.readouterr()[0])
+    assert [f["effect"] for f in said["findings"]] == ["viscous_friction"]
+    assert said["replays"]
+    assert any("1 meshes, textures or attached models (hall.obj, ...)" in note for note in said["notes"])
+    corrected = jaxpanda.Arm.from_mjcf(out / "corrected.xml")
+    np.testing.assert_allclose(corrected.damping, arm.damping + np.array([0, 3, 0]), atol=0.1)
+    assert (tmp_path / "in" / "parts" / "arm.xml").read_bytes() == (MODELS / "parts" / "arm.xml").read_bytes()
+    assert "parts/arm.xml" in (out / "report.html").read_text()
+    assert jaxpanda.replay(out, log).rmse.max() < 0.1

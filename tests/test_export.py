@@ -5,6 +5,7 @@ import difflib
 import json
 import re
 import shutil
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -17,7 +18,7 @@ from mjcf_cases import CASES, FILES, MODELS, chain_of, mujoco_torque, random_sta
 
 from jaxpanda import export, markup
 from jaxpanda.errors import InputError
-from jaxpanda.export import export_mjcf, not_held, panda_mjcf, sidecar, write_parameters
+from jaxpanda.export import edit_mjcf, not_held, panda_mjcf, sidecar, write_parameters
 from jaxpanda.friction import Friction
 from jaxpanda.mjcf import from_document, from_mjcf, standard_from_com
 from jaxpanda.panda import panda, published
@@ -272,7 +273,7 @@ def test_meshes_that_the_new_file_will_not_find_are_said(tmp_path):
     result = write_parameters(source, arm)
     assert result.save(tmp_path / "beside.xml") == ()
     (warning,) = result.save(tmp_path / "elsewhere" / "arm.xml")
-    assert warning.startswith("1 meshes or textures (assets/hand.obj")
+    assert warning.startswith("1 meshes, textures or attached models (assets/hand.obj")
 
 
 def test_generated_bodies_are_refused(tmp_path):
@@ -292,7 +293,8 @@ def test_generated_bodies_are_refused(tmp_path):
 def test_the_attribute_editor_sets_adds_and_takes_away():
     text = "<mujoco><worldbody> <body name='b' pos='1 2 3'><joint\n name=\"j\"/></body></worldbody></mujoco>"
     changes = {("body", "b"): {"pos": None, "quat": "1 0 0 0"}, ("joint", "j"): {"user": '"<&'}}
-    assert export_mjcf(text, changes) == (
+    document = markup.parse(text, "mujoco", Path("model.xml"))
+    assert edit_mjcf(document, changes).text == (
         "<mujoco><worldbody> <body name='b' quat=\"1 0 0 0\"><joint\n"
         ' name="j" user="&quot;&lt;&amp;"/></body></worldbody></mujoco>'
     )
@@ -304,7 +306,7 @@ def test_the_attribute_editor_sets_adds_and_takes_away():
 )
 def test_the_attribute_editor_names_what_it_cannot_reach(key, reason):
     with pytest.raises(InputError, match=reason):
-        export_mjcf(MODELS / "including.xml", {key: {"damping": "1"}})
+        edit_mjcf(markup.read(MODELS / "including.xml", "mujoco"), {key: {"damping": "1"}})
 
 
 def test_the_own_panda_is_the_published_one():

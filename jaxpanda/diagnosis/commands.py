@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from .. import markup, report
+from .. import report
 from ..errors import InputError
+from ..export import missing_assets
 from ..files import output_folder, write_text
-from ..mjcf import from_document, from_mjcf
 from ..recordings import Recording, load, load_many
 from ..rollout import compare
 from . import page
@@ -57,22 +57,21 @@ def diagnose_files(
         found = diagnose(model, loaded, reference=load_many(reference), knowledge=knowledge)
         named = [*(("recording", p) for p in recordings), *(("reference", p) for p in reference)]
         sources = tuple(_source(role, path) for role, path in ([("model", model)] if model else []) + named)
-        found = _replayed(dataclasses.replace(found, sources=sources), model, loaded)
-        found.save(folder)
+        notes = (*found.notes, *missing_assets(found.written, out))
+        found = _replayed(dataclasses.replace(found, sources=sources, notes=notes), loaded)
         report.to_html("jaxpanda: diagnosis", page.sections(found), folder / "report.html")
+        found.save(out)  # not by way of the other folder: what is included may belong outside of `out`
     return found
 
 
-def _replayed(found: Diagnosis, model: Path | None, recordings: Sequence[Recording]) -> Diagnosis:
+def _replayed(found: Diagnosis, recordings: Sequence[Recording]) -> Diagnosis:
     """With how closely both simulations follow a recording, the one in which something happened if any."""
     if not found.findings:
         return found
     once = [f.recordings[0] for f in found.findings if f.intervals is not None]
     recording = next((r for r in recordings if r.name in once), recordings[0])
-    own = markup.parse(found.model_xml, "mujoco", Path("panda.xml"))
-    source = (from_document(own) if model is None else from_mjcf(model))[1]
     try:
-        return dataclasses.replace(found, replays=(compare(found.corrected, source, recording),))
+        return dataclasses.replace(found, replays=(compare(found.corrected, found.source, recording),))
     except InputError as error:
         return dataclasses.replace(found, notes=(*found.notes, f"not replayed in simulation: {error}"))
 

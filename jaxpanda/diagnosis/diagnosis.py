@@ -14,9 +14,9 @@ from jaxtyping import Float
 from .. import files, markup
 from .. import signals as signals_
 from ..arm import Arm
-from ..corrected import SCHEMA, Corrected
+from ..corrected import FILE, SCHEMA, XML, Corrected
 from ..errors import InputError, require_x64
-from ..export import export_mjcf, panda_mjcf, write_parameters
+from ..export import edit_mjcf, missing_assets, panda_mjcf, write_document, write_parameters
 from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, load
 from . import knowledge as knowledge_
@@ -33,8 +33,6 @@ from .traces import Trace, prepare
 from .uncertainty import polished
 from .unnamed import BEYOND
 
-CORRECTED = "corrected.json"
-"""What `predict` reads."""
 NEXT_MOTION = "next_motion.csv"
 
 
@@ -60,14 +58,15 @@ class Diagnosis:
     findings: tuple[Finding, ...]
     fit: Fit
     corrected: Corrected
-    corrected_xml: str
+    written: markup.Document
+    """The user's file and what it includes, with what MuJoCo can hold of the corrected model."""
     notes: tuple[str, ...]
     """What was done to the recordings, and what the corrected file cannot hold."""
     log: tuple[str, ...]
     """What the search tried, in its order."""
     problem: Problem = dataclasses.field(repr=False)
     state: State = dataclasses.field(repr=False)
-    model_xml: str = dataclasses.field(repr=False)
+    source: MjcfSource = dataclasses.field(repr=False)
     """The simulation as it was given."""
     knowledge: knowledge_.Knowledge
     spread: Float[np.ndarray, "standard n"] = dataclasses.field(repr=False)
@@ -76,6 +75,11 @@ class Diagnosis:
     """Files that went in: role, name and sha256."""
     replays: tuple[Mapping[str, Any], ...] = ()
     """How closely both simulations follow recordings, as `jaxpanda.rollout.compare` says it; may be left out."""
+
+    @property
+    def corrected_xml(self) -> str:
+        """Text of the corrected MJCF."""
+        return self.written.text
 
     @functools.cached_property
     def localisation(self) -> tuple[Localisation, Localisation]:
@@ -143,17 +147,23 @@ class Diagnosis:
         }[self.verdict]
         return [sentence, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]
 
-    def save(self, folder: str | Path) -> None:
-        """Write diagnosis.json, corrected.xml and corrected.json; next_motion.csv where one would decide."""
-        folder = Path(folder)
-        files.write_json(folder / "diagnosis.json", self.to_json())
-        files.write_text(folder / "corrected.xml", self.corrected_xml)
+    def save(self, folder: str | Path) -> tuple[str, ...]:
+        """Write diagnosis.json, corrected.xml with what it includes, and corrected.json; next_motion.csv where
+        one would decide. What corrected.xml will not find there comes back, a sentence each.
+
+        Raises:
+            InputError: an included file of that name stands there with another content; nothing is written.
+        """
+        folder, document = Path(folder), self.to_json()
+        write_document(self.written, folder / XML)
+        files.write_json(folder / "diagnosis.json", document)
         files.write_json(
-            folder / CORRECTED,
+            folder / FILE,
             {**self.corrected.to_json(), "torque_noise": [float(v) for v in self.fit.noise_floor]},
         )
         if self.next_motion is not None:
             self.next_motion.save(folder / NEXT_MOTION)
+        return missing_assets(self.written, folder)
 
 
 @on_host
@@ -220,14 +230,14 @@ def diagnose(
                    f" where it was not fitted: {', '.join(sorted(dropped))}"),
         )  # fmt: skip
     # numbers that only moved within what they were uncertain by stay as the user wrote them
-    text, warnings = _corrected_xml(source, corrected if wrong else corrected.as_written)
+    written, warnings = _written(source, corrected if wrong else corrected.as_written)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
         verdict=_verdict((*found, *wrong), partly(state)),
         findings=(*found, *wrong),
         fit=fit(problem, kept),
         corrected=corrected,
-        corrected_xml=text,
+        written=written,
         notes=(
             *premises.notes,
             *repairs,
@@ -240,7 +250,7 @@ def diagnose(
         log=tuple(log),
         problem=problem,
         state=state,
-        model_xml=source.text,
+        source=source,
         knowledge=premises.knowledge,
         spread=premises.spread,
     )
@@ -380,11 +390,11 @@ def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) ->
     )
 
 
-def _corrected_xml(source: MjcfSource, corrected: Corrected) -> tuple[str, tuple[str, ...]]:
+def _written(source: MjcfSource, corrected: Corrected) -> tuple[markup.Document, tuple[str, ...]]:
     """The user's file with what MuJoCo holds natively put in, and what could not be."""
     moved = bool(np.any(np.asarray(corrected.change)))
     if not (corrected.effects or moved):
-        return source.text, ()
+        return source.document, ()
     native = corrected.native
     moved = moved or any(hasattr(e, "standard_change") for e in corrected.effects)
     warnings: list[str] = []
@@ -398,16 +408,16 @@ def _corrected_xml(source: MjcfSource, corrected: Corrected) -> tuple[str, tuple
     except InputError as error:
         warnings.append(f"corrected.xml: link inertias are left as they were: {error}")
         result = write_parameters(source, arm, None)
-    text = result.text
+    document = result.document
     if not np.allclose(np.asarray(native.chain.gravity), np.asarray(corrected.arm.chain.gravity)):
         value = " ".join(repr(float(v)) for v in np.asarray(native.chain.gravity))
         try:
-            text = export_mjcf(text, {("option", ""): {"gravity": value}})
+            document = edit_mjcf(document, {("option", ""): {"gravity": value}})
         except InputError as error:
             warnings.append(f"corrected.xml: gravity should be {value}: {error}")
     beyond = [f"corrected.xml cannot hold {e.name}: {e.equation}" for e, _ in corrected.beyond]
     warnings += dict.fromkeys(beyond)  # once, however many joints it is at
-    return text, (*warnings, *result.warnings)
+    return document, (*warnings, *result.warnings)
 
 
 def predict(folder: str | Path, motion: str | Path | Recording) -> Float[np.ndarray, "rows dof"]:
@@ -417,7 +427,7 @@ def predict(folder: str | Path, motion: str | Path | Recording) -> Float[np.ndar
         InputError: no saved diagnosis in the folder, or a motion of another arm.
     """
     require_x64("a prediction")
-    path = Path(folder) / CORRECTED
+    path = Path(folder) / FILE
     document = files.read_json(path)
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise InputError(f"{path}: is no corrected model; --diagnosis needs a folder that `diagnose` wrote")

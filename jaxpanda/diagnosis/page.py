@@ -613,18 +613,12 @@ def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
 
 def _file(found: Diagnosis) -> Section:
     lines = []
-    for line in difflib.unified_diff(
-        found.model_xml.splitlines(),
-        found.corrected_xml.splitlines(),
-        "your model",
-        "corrected.xml",
-        "",
-        "",
-        2,
-        "",
-    ):
-        kind = "note" if line[:2] in ("++", "--", "@@") else {"+": "add", "-": "cut"}.get(line[:1], "")
-        lines.append((kind, line))
+    for name, text in found.written.texts.items():
+        before, after = found.source.document.texts[name].splitlines(), text.splitlines()
+        names = f"your {name or 'model'}", name or "corrected.xml"
+        for line in difflib.unified_diff(before, after, *names, n=2, lineterm=""):
+            kind = "note" if line[:2] in ("++", "--", "@@") else {"+": "add", "-": "cut"}.get(line[:1], "")
+            lines.append((kind, line))
     cannot = [note for note in found.notes if note.startswith("corrected.xml")]
     sentences = [
         "What MuJoCo's own attributes can hold of the findings:"
