@@ -19,7 +19,7 @@ from .identification import Identification, identify, identify_mass_gravity
 from .inspection import Inspection, inspect
 from .lint import lint
 from .mjcf import from_document, from_mjcf
-from .recordings import Recording, load_many
+from .recordings import Recording, distinct, load_many
 from .retrieval import CHECKPOINT_FILE, Retrieval, retrieve
 from .session import progress
 from .validation import Validation, validate
@@ -34,7 +34,7 @@ def recordings_of(paths: Sequence[Path], arm: Arm | None = None) -> list[Recordi
     """Read recordings, and make sure that they are of this arm."""
     if not paths:
         raise InputError("--recording: none given; name at least one file or folder")
-    recordings = load_many(paths)
+    recordings = distinct(load_many(paths))
     for recording in recordings:
         if arm is not None:
             recording.require_dof(arm.dof)

@@ -148,7 +148,7 @@ def replay(
     recording = recording if isinstance(recording, Recording) else load_recording(recording)
     recording.require_dof(corrected.arm.dof)
     recording.require_tau()
-    plant = corrected.plant(recording.name)
+    plant = corrected.plant(_called(corrected, recording))
     bare = engine_model(source, plant.arm)
     task = make_task(
         recording, bare.opt.timestep, plant, seconds, _begin(plant, seconds) if start is None else start
@@ -167,7 +167,7 @@ def compare(
     """
     require_x64("a replay")
     arm = corrected.arm
-    plants = [Plant.of(arm, arm, ()), corrected.plant(recording.name)]
+    plants = [Plant.of(arm, arm, ()), corrected.plant(_called(corrected, recording))]
     gains, start = make_gains(recording, corrected.arm), _begin(plants[1], seconds)
     out: dict[str, Any] = {"recording": recording.name}
     for when, plant in zip(("before", "after"), plants, strict=True):
@@ -194,6 +194,17 @@ def compare_files(
     """`compare`, from the folder that `diagnose` wrote, the user's MJCF and a recording."""
     corrected, source = _opened(diagnosis, model)
     return compare(corrected, source, load_recording(recording), seconds=seconds)
+
+
+def _called(corrected: Corrected, recording: Recording) -> str:
+    """The recording's name, with the folders that the diagnosis may have put before it."""
+    if recording.path is None:
+        return recording.name
+    parts = (*recording.path.resolve().parts[:-1], recording.name)
+    names = [e.recording for e in corrected.effects if e.bound_to_recording]  # pyright: ignore
+    return next(
+        (name for name in names if parts[-len(Path(name).parts) :] == Path(name).parts), recording.name
+    )
 
 
 def engine_model(source: MjcfSource, arm: Arm) -> mujoco.MjModel:

@@ -445,6 +445,8 @@ def test_bad_calls_say_what_would_work():
     stuck = dataclasses.replace(live, tau=np.where(np.arange(7) == 4, 0.3, live.tau))
     with pytest.raises(InputError, match="tau_5 never changes"):
         diagnose(None, [stuck])
+    with pytest.raises(InputError, match=r"motion_0\.csv: is given twice"):
+        diagnose(None, [live], reference=[live])
     with pytest.raises(InputError, match="tau_1"):
         diagnose(None, [dataclasses.replace(record(0), tau=None)])
 

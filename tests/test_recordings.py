@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxpanda.errors import InputError, MissingExtraError
-from jaxpanda.recordings import Recording, load, load_many, save
+from jaxpanda.recordings import Recording, distinct, load, load_many, save
 from jaxpanda.recordings.ticks import consistent, reconstruct
 
 
@@ -425,6 +425,22 @@ def test_a_folder_with_several_runs_is_split_where_time_goes_back(tmp_path):
     assert len({run.name for run in runs}) == 2
     with pytest.raises(InputError, match=r"2 runs \(1000 rows, 600 rows\)"):
         load(tmp_path)
+
+
+def test_recordings_of_one_name_are_called_by_their_folders(tmp_path):
+    """Of two files `run.csv` both were called that, and what was found in one was looked up in the other."""
+    made = Recording("made", np.arange(500) * 1e-2, motion(np.arange(500) * 1e-2))
+    paths = [tmp_path / name for name in ("a/x/run.csv", "b/x/run.csv", "b/y/run.csv", "b/x/other.csv")]
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(made, path)
+    named = distinct(load_many(paths))
+    assert [r.name for r in named] == ["a/x/run.csv", "b/x/run.csv", "y/run.csv", "other.csv"]
+    assert [r.name for r in distinct(named)] == [r.name for r in named]
+    with pytest.raises(InputError, match=r"b/x/run\.csv: is given twice"):
+        distinct(load_many([*paths, tmp_path / "a" / ".." / "b" / "x" / "run.csv"]))
+    with pytest.raises(InputError, match="made: is given twice, where each recording counts once"):
+        distinct([made, made])
 
 
 def test_files_of_one_log_are_cut_to_the_shortest_and_counted(tmp_path):

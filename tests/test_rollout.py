@@ -25,7 +25,7 @@ from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TorqueOffset
 from jaxpanda.effects.unknown import Unknown, UnknownAt, UnknownOfTwo
 from jaxpanda.mjcf import from_document
-from jaxpanda.recordings import Recording
+from jaxpanda.recordings import Recording, save
 from jaxpanda.simulation import JointFriction, Sensors, fourier_trajectory, simulate
 
 TWO = """<mujoco><option timestep="0.002"/><worldbody><body name="upper" pos="0 0 0.3">
@@ -196,6 +196,19 @@ def test_a_body_is_taken_up_and_a_push_is_felt_in_the_recording_they_happened_in
     apart = np.abs(here.q - nothing.q).max(1)
     assert apart[here.time < 1.5].max() < 1e-5  # rounding, which grows in an arm that nothing holds
     assert apart[(here.time > 1.7) & (here.time < 2.0)].min() > 1e-3
+
+
+@pytest.mark.parametrize(("folder", "felt"), [("monday", True), ("tuesday", False)])
+def test_a_push_is_felt_in_the_one_of_two_recordings_of_one_name(moved, tmp_path, folder, felt):
+    arm, source = two_links()
+    push = ExternalContact(1, 1.6, 2.0, "monday/a.csv", "base"), [0.0, 0.0, -20.0, 0.0, 0.0, 0.0]
+    (tmp_path / folder).mkdir()
+    save(moved, tmp_path / folder / "a.csv")
+    found = rollout.replay(
+        corrected(arm, push), tmp_path / folder / "a.csv", model=source, seconds=1.0, start=1.2
+    )
+    nothing = rollout.replay(corrected(arm), moved, model=source, seconds=1.0, start=float(found.time[0]))
+    assert (np.abs(found.q - nothing.q).max() > 1e-3) == felt
 
 
 def test_the_right_friction_brings_the_simulation_to_the_recorded_motion(moved):

@@ -2,7 +2,7 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from .. import report
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_folder, write_text
-from ..recordings import Recording, load, load_many
+from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
 from . import page
 from .diagnosis import Diagnosis, diagnose, predict
@@ -53,12 +53,16 @@ def diagnose_files(
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
     with output_folder(out) as folder:
-        loaded = load_many(recordings)
-        found = diagnose(model, loaded, reference=load_many(reference), knowledge=knowledge)
-        named = [*(("recording", p) for p in recordings), *(("reference", p) for p in reference)]
-        sources = tuple(_source(role, path) for role, path in ([("model", model)] if model else []) + named)
+        suspect, healthy = load_many(recordings), load_many(reference)
+        every = distinct([*suspect, *healthy])
+        suspect, healthy = every[: len(suspect)], every[len(suspect) :]
+        found = diagnose(model, suspect, reference=healthy, knowledge=knowledge)
+        given = [("model", p) for p in [model] if p]
+        given += [("recording", p) for p in recordings] + [("reference", p) for p in reference]
+        names = {r.path: r.name for r in every}
+        sources = tuple(_source(role, path, names) for role, path in given)
         notes = (*found.notes, *missing_assets(found.written, out))
-        found = _replayed(dataclasses.replace(found, sources=sources, notes=notes), loaded)
+        found = _replayed(dataclasses.replace(found, sources=sources, notes=notes), suspect)
         report.to_html("jaxpanda: diagnosis", page.sections(found), folder / "report.html")
         found.save(out)  # not by way of the other folder: what is included may belong outside of `out`
     return found
@@ -76,13 +80,14 @@ def _replayed(found: Diagnosis, recordings: Sequence[Recording]) -> Diagnosis:
         return dataclasses.replace(found, notes=(*found.notes, f"not replayed in simulation: {error}"))
 
 
-def _source(role: str, path: Path) -> dict[str, str]:
+def _source(role: str, path: Path, names: Mapping[Path | None, str]) -> dict[str, str]:
     """Name and digest of a file, or of all files of a folder in the order of their names."""
     parts = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part.read_bytes())
-    return {"role": role, "name": path.name, "sha256": digest.hexdigest()}
+    name = path.name if path.is_dir() else names.get(path, path.name)
+    return {"role": role, "name": name, "sha256": digest.hexdigest()}
 
 
 def predict_files(diagnosis: Path, recording: Path, out: Path) -> Prediction:

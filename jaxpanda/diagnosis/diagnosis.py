@@ -18,7 +18,7 @@ from ..corrected import FILE, SCHEMA, XML, Corrected
 from ..errors import InputError, require_x64
 from ..export import edit_mjcf, missing_assets, panda_mjcf, write_document, write_parameters
 from ..mjcf import MjcfSource, from_document, from_mjcf
-from ..recordings import Recording, load
+from ..recordings import Recording, distinct, load
 from . import knowledge as knowledge_
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
@@ -183,7 +183,7 @@ def diagnose(
         knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` explains the words.
 
     Raises:
-        InputError: a file that cannot be read, or a recording that does not fit the model.
+        InputError: a file that cannot be read, a recording that does not fit the model, or one given twice.
     """
     require_x64("a diagnosis")
     knowledge_.check(knowledge)
@@ -193,14 +193,12 @@ def diagnose(
         arm, source = from_mjcf(model)
     if not recordings:
         raise InputError("no recording: a diagnosis needs at least one")
-    traces, active = [], []
-    for group, on in ((recordings, True), (reference, False)):
-        for one in group:
-            recording = one if isinstance(one, Recording) else load(one)
-            recording.require_dof(arm.dof)
-            _require_live_torque(recording)
-            traces.append(prepare(recording, arm))
-            active.append(on)
+    loaded = [one if isinstance(one, Recording) else load(one) for one in (*recordings, *reference)]
+    traces, active = [], [i < len(recordings) for i in range(len(loaded))]
+    for recording in distinct(loaded):
+        recording.require_dof(arm.dof)
+        _require_live_torque(recording)
+        traces.append(prepare(recording, arm))
     suspect = [trace for trace, on in zip(traces, active, strict=True) if on]
     if not any(trace.trust.any() for trace in suspect):
         raise InputError(

@@ -1,8 +1,9 @@
 """Recordings from files and folders, and back."""
 
+import dataclasses
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..errors import InputError
@@ -52,6 +53,29 @@ def load_many(paths: Iterable[str | Path]) -> list[Recording]:
     for path in map(Path, paths):
         recordings += read_raw_logs(path) if path.is_dir() else [load(path)]
     return recordings
+
+
+def distinct(recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings, those of one name called by as much of their paths as tells them apart.
+
+    Raises:
+        InputError: one is there twice, or two that come from no file have one name.
+    """
+    paths = [r.path.resolve().parts if r.path else None for r in recordings]
+    out = []
+    for i, (one, path) in enumerate(zip(recordings, paths, strict=True)):
+        others = [paths[k] for k, r in enumerate(recordings) if r.name == one.name and k != i]
+        if others and (path is None or None in others or path in others):
+            raise InputError(
+                f"{one.path or one.name}: is given twice, where each recording counts once and needs a name of"
+                " its own"
+            )
+        count = 1
+        while path and any(other and path[-count:] == other[-count:] for other in others):
+            count += 1
+        name = Path(*path[-count:-1], one.name).as_posix() if path and others else one.name
+        out.append(dataclasses.replace(one, name=name))
+    return out
 
 
 def save(recording: Recording, path: str | Path) -> None:

@@ -18,7 +18,7 @@ class Recording:
     """
 
     name: str
-    """File or folder name, as messages and `diagnosis.json` call it."""
+    """File or folder name, as messages and `diagnosis.json` call it; `distinct` puts folders before it."""
     time: Float[np.ndarray, " time"]
     """[s]"""
     q: Float[np.ndarray, "time dof"]
