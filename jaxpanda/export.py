@@ -36,7 +36,6 @@ from .lint import ignored_by_mjx
 from .markup import numbers
 from .mjcf import MjcfLink, MjcfSource, com_from_standard, from_document, move_standard, standard_from_com
 from .panda import panda, published
-from .urdf import to_urdf as to_urdf
 
 SIDECAR = "jaxpanda.sidecar/1"
 TORQUE_LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)

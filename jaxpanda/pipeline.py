@@ -12,7 +12,7 @@ import numpy as np
 from . import markup
 from .arm import Arm
 from .errors import InputError
-from .export import Change, not_held, panda_mjcf, read_sidecar, to_urdf, write_parameters
+from .export import Change, panda_mjcf, read_sidecar, write_parameters
 from .files import output_folder, write_text
 from .friction import Friction
 from .identification import Identification, identify, identify_mass_gravity
@@ -22,6 +22,7 @@ from .mjcf import from_document, from_mjcf
 from .recordings import Recording, distinct, load_many
 from .retrieval import CHECKPOINT_FILE, Retrieval, retrieve
 from .session import progress
+from .urdf import left_out, to_urdf
 from .validation import Validation, validate
 
 
@@ -186,7 +187,7 @@ def to_mjcf(links: Retrieval, out: str | Path, model: str | Path | None = None) 
     arm = dataclasses.replace(arm, **{name: jnp.asarray(values) for name, values in links.known.items()})
     if out.suffix == ".urdf":
         write_text(out, to_urdf(arm, links.standard, links.friction))
-        return Export(out, (), not_held(arm, links.friction))
+        return Export(out, (), tuple(f"not in {out.name}: {what}" for what in left_out(arm, links.friction)))
     written = write_parameters(source, arm, links.standard, links.friction)
     return Export(out, () if own else written.changes, (*written.warnings, *written.save(out)))
 

@@ -23,7 +23,7 @@ def to_urdf(
     """URDF of the arm: links, joints, limits and friction.
 
     Every link's frame is the arm's, with its joint along z. URDF has no gravity, no armature, no springs
-    and no constant torque; a comment in the file says which of them were left out.
+    and no constant torque, and readers refuse friction below zero; a comment in the file says what was `left_out`.
 
     Args:
         arm: geometry, limits, and the friction that its model holds already.
@@ -33,12 +33,13 @@ def to_urdf(
         velocity: largest velocity of each joint [rad/s].
     """
     phi = np.asarray(arm.standard if standard is None else standard, float)
-    found = friction if friction is not None and friction.model not in ("none", "sigmoid") else None
-    damping = np.asarray(arm.damping, float) + (found.viscous if found else 0)
-    coulomb = np.asarray(arm.frictionloss, float) + (found.coulomb if found else 0)
+    damping, coulomb = (np.maximum(values, 0) for values in _laws(arm, friction).values())
     effort = np.full(arm.dof, UNLIMITED) if effort is None else effort
     velocity = np.full(arm.dof, UNLIMITED) if velocity is None else velocity
-    lines = [f'<robot name="{quote(arm.name)}">', *_left_out(arm, friction), f'  <link name="{_base(arm)}"/>']
+    lines = [f'<robot name="{quote(arm.name)}">']
+    if parts := left_out(arm, friction):
+        lines.append(f"  <!-- not in this file: {'; '.join(parts)} -->")
+    lines.append(f'  <link name="{_base(arm)}"/>')
     parents = (_base(arm), *arm.link_names)
     for i in range(arm.dof):
         lines += _link(arm.link_names[i], phi[i])
@@ -83,8 +84,17 @@ def _link(name: str, phi: np.ndarray) -> list[str]:
     ]
 
 
-def _left_out(arm: Arm, friction: Friction | None) -> list[str]:
-    """A comment naming what the URDF does not hold."""
+def _laws(arm: Arm, friction: Friction | None) -> dict[str, np.ndarray]:
+    """URDF's two numbers of each joint's friction, as they came out."""
+    found = friction if friction is not None and friction.model not in ("none", "sigmoid") else None
+    return {
+        "damping": np.asarray(arm.damping, float) + (found.viscous if found else 0),
+        "friction": np.asarray(arm.frictionloss, float) + (found.coulomb if found else 0),
+    }
+
+
+def left_out(arm: Arm, friction: Friction | None) -> list[str]:
+    """What the URDF does not hold."""
     parts = []
     if np.any(np.asarray(arm.armature)):
         parts.append("armature " + numbers(arm.armature))
@@ -94,7 +104,9 @@ def _left_out(arm: Arm, friction: Friction | None) -> list[str]:
         parts.append("sigmoid friction")
     elif friction is not None and np.any(friction.offset):
         parts.append("torque offsets " + numbers(friction.offset))
-    return [f"  <!-- not in this file: {'; '.join(parts)} -->"] if parts else []
+    for name, values in _laws(arm, friction).items():
+        parts += [f"{name} {values[j]:.4g} of joint {j + 1}, below zero" for j in np.flatnonzero(values < 0)]
+    return parts
 
 
 def _base(arm: Arm) -> str:

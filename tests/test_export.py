@@ -398,6 +398,18 @@ def test_what_urdf_cannot_hold_is_said_in_it():
     assert re.search(r"<!-- not in this file: armature .*; joint springs .*; torque offsets .* -->", text)
 
 
+def test_friction_below_zero_is_not_written_and_said():
+    """pinocchio refuses it, and so do others."""
+    arm = from_mjcf(MODELS / "odd_axes.xml")[0]
+    less = {"viscous": -2 * np.asarray(arm.damping) - 0.1, "coulomb": -9 - np.asarray(arm.frictionloss)}
+    text = to_urdf(arm, friction=Friction("coulomb_viscous", less))
+    assert set(re.findall(r'<dynamics damping="(.*)" friction="(.*)"', text)) == {("0.0", "0.0")}
+    comment = re.search(r"<!-- not in this file: (.*) -->", text)
+    assert comment is not None
+    assert "damping -0.1" in comment[1]
+    assert comment[1].count("friction -9 of joint") == 6
+
+
 def test_no_array_of_the_model_is_named_that_mujoco_does_not_have():
     model = mujoco.MjModel.from_xml_string(panda_mjcf())
     named = [*export._FOLLOWS, *(name for names in export._WRITTEN.values() for name in names)]
