@@ -1,8 +1,8 @@
 """From recordings of a robot arm to a model that could be built, one function a stage.
 
-    recording = jaxpanda.load("arm.csv")
-    found = jaxpanda.identify([recording], jaxpanda.Arm.panda())
-    links = jaxpanda.retrieve(found)
+    recording, arm = jaxpanda.load("arm.csv"), jaxpanda.Arm.panda()
+    found = jaxpanda.identify([recording], arm)
+    links = jaxpanda.retrieve(found, arm=arm)
     jaxpanda.to_mjcf(links, "arm.xml")
     jaxpanda.validate("arm.xml", [recording])
 

@@ -23,7 +23,8 @@ def to_urdf(
     """URDF of the arm: links, joints, limits and friction.
 
     Every link's frame is the arm's, with its joint along z. URDF has no gravity, no armature, no springs
-    and no constant torque, and readers refuse friction below zero; a comment in the file says what was `left_out`.
+    and no constant torque, and its readers refuse friction below zero; a comment in the file says what was
+    left out.
 
     Args:
         arm: geometry, limits, and the friction that its model holds already.

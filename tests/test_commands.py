@@ -30,7 +30,8 @@ def recording(tmp_path_factory) -> Path:
     return path
 
 
-MODELS = Path(__file__).parent / "models"
+ROOT = Path(__file__).parents[1]
+MODELS = ROOT / "tests" / "models"
 
 
 def shaken(arm, extra=None, seconds: float = 8.0) -> Recording:
@@ -122,6 +123,24 @@ def test_the_chain_of_commands_leaves_what_the_interface_promises(capsys, record
     assert checked["mjx_vs_mujoco"] < 1e-9
     assert checked["relative_error_percent"] < 5
     assert max(checked["rollout_rmse_rad"]) < 0.2
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["the project's Panda", "an arm of the user's"])
+def test_the_readme_s_example_runs_for_any_arm(own, recording, tmp_path, monkeypatch):
+    """Of a user's arm it ended in "bounds: none are known for the arm"."""
+    monkeypatch.chdir(tmp_path)
+    code = re.search(r"```python\n(import jax\n.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert code is not None
+    text = code[1].replace("starts=2048", "starts=16")
+    if own:
+        shutil.copy(recording, "arm.csv")
+    else:
+        shutil.copy(MODELS / "odd_axes.xml", "arm.xml")
+        save(shaken(jaxpanda.Arm.from_mjcf("arm.xml")), Path("arm.csv"))
+        text = re.sub(r"^(arm = |)\S.*# or (.*\))$", r"\1\2", text, flags=re.MULTILINE)
+        assert text.count('"arm.xml"') == 2
+    exec(text, {})
+    assert Path("found.xml").exists()
 
 
 def test_a_failed_stage_leaves_nothing(capsys, recording, tmp_path):
