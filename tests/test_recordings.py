@@ -152,6 +152,11 @@ BAD = {
     "a decimal comma": (lambda c: text(c).replace("0.01,", "0,01,", 1), r"row 2 \(line 3\) has 8 cells"),
     "a short row": (lambda c: text([*c[:5], c[5][:3], *c[6:]]), r"row 5 \(line 6\) has 3 cells"),
     "a cut last row": (lambda c: text(c)[:-30], r"row 100 \(line 101\)"),
+    "a comma at the end of every line": (lambda c: text([[*r, ""] for r in c]), "every line ends with ','"),
+    "a comma at the end of a line": (
+        lambda c: text([*c[:4], [*c[4], ""], *c[5:]]),
+        r"row 4 \(line 5\) ends with ','",
+    ),
     "a missing column": (lambda c: text([r[:2] + r[3:] for r in c]), r"dq_1 \.\.\. dq_2.*or leave all dq"),
     "a hole among columns": (lambda c: text([r[:1] + r[2:] for r in c]), "column q_1 is missing"),
     "no time": (lambda c: text([r[1:] for r in c]), "no column time"),
@@ -172,6 +177,10 @@ BAD = {
         r"column q_1, row \d+ \(line \d+\): the angle jumps by a turn.*numpy.unwrap",
     ),
     "degrees per second": (_scaled(slice(3, 5), 180 / np.pi), "dq looks like degrees per second"),
+    "no torque of a joint": (
+        _scaled(slice(5, 7), 1e200),
+        r"column tau_\d reaches .*e\+\d+ at .* no joint bears",
+    ),
     "milliseconds": (_scaled(slice(0, 1), 1e3), "looks like milliseconds.*divide it by 1000"),
     "microseconds": (_scaled(slice(0, 1), 1e6), "looks like microseconds"),
     "10 Hz": (_scaled(slice(0, 1), 10), "10 Hz.*50 Hz to 4000 Hz"),

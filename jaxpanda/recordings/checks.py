@@ -13,6 +13,8 @@ RATES = (50.0, 4000.0)
 """Sample rates that occur [Hz]."""
 SHORTEST = 0.25
 """Nothing can be said about a motion shorter than this [s]."""
+STRONGEST = 1e9
+"""No joint bears such a torque [N m]."""
 _MARGIN = 1.1  # on `RATES`: a nominal 50 Hz log may run at 48
 _TURN = 2 * np.pi
 _WRAPS = 0.5
@@ -44,6 +46,7 @@ def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Re
     _unwrapped(recording, row)
     recording = without_glitches(recording)
     _radians(recording)
+    _newton_metres(recording)
     _velocity_unit(recording)
     return recording
 
@@ -152,6 +155,16 @@ def _turns_on(recording: Recording, far: Bool[np.ndarray, " dof"]) -> bool:
     speed = np.abs(recording.q[apart:] - recording.q[:-apart]) / elapsed
     moves = np.any(np.ptp(near, axis=0) > _TRAVELS) and np.all(np.abs(near) < _TURN)
     return bool(moves and np.all(speed < _FASTEST))
+
+
+def _newton_metres(recording: Recording) -> None:
+    if recording.tau is None or (size := np.abs(recording.tau)).max() < STRONGEST:
+        return
+    row, j = np.unravel_index(np.argmax(size), size.shape)
+    raise InputError(
+        f"{recording.name}: column tau_{j + 1} reaches {recording.tau[row, j]:g} at {recording.time[row]:g} s, "
+        "which no joint bears: check its unit (N m), or leave out the rows that were not measured"
+    )
 
 
 def _velocity_unit(recording: Recording) -> None:

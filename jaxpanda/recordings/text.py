@@ -74,6 +74,9 @@ def _first_fault(lines: list[str], delimiter: str | None, columns: list[str], fi
         row += 1
         where = f"row {row} (line {number})"
         cells = line.split(delimiter)
+        if len(cells) > 1 and not cells[-1].strip() and (not columns[-1] or len(cells) == len(columns) + 1):
+            every = "every line" if not columns[-1] else where
+            return f"{every} ends with {delimiter!r}, after which nothing comes: take it off"
         if len(cells) != len(columns):
             return (
                 f"{where} has {len(cells)} cell{'s' * (len(cells) != 1)}, where the columns are "
