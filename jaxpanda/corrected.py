@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import numpy as np
 from jaxpanda_kernels import Chain
 from jaxtyping import Array, Float
 
+from . import files
 from .arm import Arm
 from .effects import (
     CATALOGUE,
@@ -23,6 +25,7 @@ from .effects import (
     sign_over_velocity,
     smooth_torque,
 )
+from .errors import InputError
 
 SCHEMA = "jaxpanda.corrected/1"
 FILE, XML = "corrected.json", "corrected.xml"
@@ -235,6 +238,41 @@ class Corrected(eqx.Module):
             tuple(effects),
             tuple(jnp.asarray(e["coefficients"], float) for e in document["effects"]),
         )
+
+
+def read(folder: str | Path) -> tuple[Corrected, Float[np.ndarray, " dof"]]:
+    """The corrected arm that `diagnose` saved, and the noise of its torque [N m].
+
+    Raises:
+        InputError: there is none, or not as `diagnose` writes it.
+    """
+    path = Path(folder) / FILE
+    document = files.read_json(path)
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+        raise InputError(f"{path}: is no corrected model; a folder that `diagnose` wrote is needed")
+    try:
+        found, noise = Corrected.from_json(document), np.asarray(document["torque_noise"], float)
+        _check_numbers(found, noise)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{path}: is not as `diagnose` writes it ({type(error).__name__}: {' '.join(str(error).split())});"
+            " diagnose again"
+        ) from None
+    return found, noise
+
+
+def _check_numbers(found: Corrected, noise: np.ndarray) -> None:
+    arm, n = found.arm, found.arm.dof
+    named = {name: np.asarray(getattr(arm, name)) for name in _ARM_FIELDS} | {
+        "change": np.asarray(found.change),
+        "damping_change": np.asarray(found.damping_change),
+        "frictionloss_change": np.asarray(found.frictionloss_change),
+        "torque_noise": noise,
+    }
+    for name, values in named.items():
+        shape = (n, 10) if name in ("standard", "change") else (n,)
+        if values.shape != shape or not (name in ("lower", "upper") or np.isfinite(values).all()):
+            raise ValueError(f"{name} must hold {' x '.join(map(str, shape))} numbers")
 
 
 class Plant(eqx.Module):

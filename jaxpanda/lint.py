@@ -9,7 +9,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from .mjcf import load_model, load_spec
+from .mjcf import load_model, load_spec, own_log
 
 OUTLIER = 3.0
 """How far a joint's friction may exceed that of every other hinge of its arm.
@@ -179,6 +179,7 @@ def _hinges(model: mujoco.MjModel) -> list[np.ndarray]:
     return [np.flatnonzero(hinge & (model.dof_treeid == tree)) for tree in range(model.ntree)]
 
 
+@own_log()
 def _joint_inertia(model: mujoco.MjModel) -> np.ndarray:
     """Diagonal of the mass matrix with the joints at mid-range, armature included [kg m²]."""
     data = mujoco.MjData(model)

@@ -11,8 +11,10 @@ brings z onto the axis, with its origin at the joint's position.
 """
 
 # MuJoCo's names come from a compiled module without stubs.
+import contextlib
 import dataclasses
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -22,7 +24,7 @@ from jaxpanda_kernels import Chain
 from jaxtyping import Float
 
 from . import markup
-from .arm import Arm
+from .arm import KNOWN, Arm
 from .errors import InputError
 
 FINGER_JOINTS = 4
@@ -93,6 +95,18 @@ class MjcfSource:
         return full
 
 
+@contextlib.contextmanager
+def own_log() -> Iterator[list[str]]:
+    """What MuJoCo warns of; it would write that to a file in the folder that it was called from."""
+    said: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        yield said
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
 def from_mjcf(path: str | Path) -> tuple[Arm, MjcfSource]:
     """The serial arm in an MJCF file, and where its parts stand in it.
 
@@ -112,22 +126,25 @@ def from_document(document: markup.Document, dropped: frozenset[int] | None = No
         document: the text.
         dropped: geoms whose mesh to leave out, as `MjcfSource` has them; else those without a say.
     """
-    spec = _parse(document)
-    dropped = _drop_looks(spec, document, dropped)
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as said, own_log() as logged:
         warnings.simplefilter("always")
+        spec = _parse(document)
+        dropped = _drop_looks(spec, document, dropped)
         model = _compile(spec, document.path)
-    notes = [f"MuJoCo warns: {warning.message}" for warning in said]
+    notes = [f"MuJoCo warns: {what}" for what in dict.fromkeys([*(str(w.message) for w in said), *logged])]
     if dropped:
         notes.append(f"{len(dropped)} mesh geoms that give looks or contacts only were not read")
     joints, locked = _serial_joints(model, document.path)
     _check_joints(model, joints, document.path)
     notes += _notes(model, joints, locked)
     links, chain, standard = _links(model, joints)
+    arm = _arm(model, links, chain, standard, spec.modelname or document.path.stem)
+    _check_finite(arm, document.path)
     source = MjcfSource(document, model, dropped, links, standard, bool(spec.compiler.degree), tuple(notes))
-    return _arm(model, links, chain, standard, spec.modelname or document.path.stem), source
+    return arm, source
 
 
+@own_log()
 def load_model(path: str | Path, *, balanceinertia: bool = False) -> mujoco.MjModel:
     """The compiled model of a file, without the meshes that only give looks or contacts.
 
@@ -145,6 +162,7 @@ def load_model(path: str | Path, *, balanceinertia: bool = False) -> mujoco.MjMo
     return _compile(spec, document.path)
 
 
+@own_log()
 def load_spec(path: str | Path) -> mujoco.MjSpec:
     """A file as MuJoCo's parser has it, before compilation.
 
@@ -344,6 +362,19 @@ def _check_joints(model: mujoco.MjModel, joints: list[int], path: Path) -> None:
     _check_actuators(model, joints, path)
     _check_tendons(model, joints, path)
     _check_loops(model, joints, path)
+
+
+def _check_finite(arm: Arm, path: Path) -> None:
+    """MuJoCo takes `nan` for a number."""
+    place = jnp.concatenate([arm.chain.R.reshape(-1, 9), arm.chain.p], 1)
+    parts = {"place": place, "inertia": arm.standard} | {name: getattr(arm, name) for name in KNOWN}
+    for what, values in parts.items():
+        bad = np.flatnonzero(~np.isfinite(np.asarray(values)).reshape(arm.dof, -1).all(1))
+        if len(bad):
+            body, joint = arm.link_names[bad[0]], arm.joint_names[bad[0]]
+            raise InputError(f"{path}: body {body!r} with joint {joint!r}: the {what} is no finite number")
+    if not np.isfinite(np.asarray(arm.chain.gravity)).all():
+        raise InputError(f"{path}: gravity is no finite number")
 
 
 def _check_actuators(model: mujoco.MjModel, joints: list[int], path: Path) -> None:

@@ -34,13 +34,12 @@ import numpy as np
 import scipy.interpolate
 from jaxtyping import Array, Float
 
-from . import files
 from .arm import Arm
-from .corrected import FILE, SCHEMA, XML, Corrected, Plant
+from .corrected import XML, Corrected, Plant, read
 from .effects import masses, slopes
 from .errors import InputError, require_x64
 from .export import dry_friction
-from .mjcf import MjcfSource, com_from_standard, from_mjcf, move_standard, standard_from_com
+from .mjcf import MjcfSource, com_from_standard, from_mjcf, move_standard, own_log, standard_from_com
 from .recordings import Recording
 from .recordings import load as load_recording
 from .signals import derivatives, prepare, zero_phase
@@ -51,7 +50,6 @@ from .validation import (
     has_run_away,
     jit_mjx,
     mjx_package,
-    own_log,
 )
 
 CUTOFF = 20.0
@@ -207,6 +205,7 @@ def _called(corrected: Corrected, recording: Recording) -> str:
     )
 
 
+@own_log()
 def engine_model(source: MjcfSource, arm: Arm) -> mujoco.MjModel:
     """The arm of a file, stripped for a roll-out, with the numbers of `arm` in it.
 
@@ -308,11 +307,7 @@ def _opened(
             raise InputError("a replay of a corrected arm needs the MJCF of the arm: give model=")
         corrected = diagnosis
     else:
-        path = Path(diagnosis) / FILE
-        document = files.read_json(path)
-        if not isinstance(document, dict) or document.get("schema") != SCHEMA:
-            raise InputError(f"{path}: is no corrected model; give a folder that `diagnose` wrote")
-        corrected = Corrected.from_json(document)
+        corrected = read(diagnosis)[0]
         model = Path(diagnosis) / XML if model is None else model
     return corrected, model if isinstance(model, MjcfSource) else from_mjcf(model)[1]
 

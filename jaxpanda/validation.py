@@ -17,7 +17,7 @@ import contextlib
 import copy
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from . import files
 from .arm import Arm
 from .errors import InputError, require_x64
 from .friction import Friction
-from .mjcf import MjcfSource, from_mjcf
+from .mjcf import MjcfSource, from_mjcf, own_log
 from .recordings import Recording
 from .signals import Signals, derivatives, prepare, zero_phase
 
@@ -267,6 +267,7 @@ _KIND = {
 }
 
 
+@own_log()
 def arm_model(source: MjcfSource) -> mujoco.MjModel:
     """The arm of a file and nothing else: no geometry, actuators, sensors or scene, grippers locked.
 
@@ -394,6 +395,7 @@ def _inverse_dynamics(arm: Arm, q, qd, qdd):
     return jax.vmap(arm.inverse_dynamics)(q, qd, qdd)
 
 
+@own_log()
 def _mujoco_inverse(source: MjcfSource, q, qd, qdd) -> Float[np.ndarray, "time dof"]:
     """`mj_inverse` of the user's whole model, gripper and scene included, with only smooth forces on."""
     model = _smooth(source.model)
@@ -517,20 +519,6 @@ def has_run_away(data: mujoco.MjData) -> bool:
     """Whether the last step met numbers that are no motion: MuJoCo would start over where it began, and go on."""
     bad = mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC
     return any(data.warning[int(one)].number for one in bad)
-
-
-@contextlib.contextmanager
-def own_log() -> Iterator[None]:
-    """MuJoCo's warnings while it steps; it would write them to a file in the folder that it was called from.
-
-    `has_run_away` sees what they say.
-    """
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 @own_log()

@@ -44,6 +44,7 @@ from jaxpanda.effects.friction import CoulombFriction, FrictionDrift, StribeckFr
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.export import panda_mjcf
+from jaxpanda.files import write_json
 from jaxpanda.mjcf import from_document
 from jaxpanda.report import to_html
 
@@ -454,6 +455,21 @@ def test_bad_calls_say_what_would_work():
 def test_prediction_refuses_a_folder_without_a_diagnosis(tmp_path):
     with pytest.raises(InputError, match=r"corrected\.json"):
         predict(tmp_path, record(0))
+
+
+def test_prediction_refuses_a_corrected_arm_that_is_not_whole(tmp_path):
+    one = Corrected(Arm.panda(), jnp.zeros((7, 10)), jnp.zeros(7), jnp.zeros(7), (), ())
+    document = {**one.to_json(), "torque_noise": [0.1] * 7}
+    write_json(tmp_path / "corrected.json", document)
+    assert np.isfinite(predict(tmp_path, record(0))).all()
+    arm = {name: value for name, value in document["arm"].items() if name != "standard"}
+    for broken, said in (
+        ({"arm": arm}, "'standard'"),
+        ({"torque_noise": [1]}, "torque_noise must hold 7 numbers"),
+    ):
+        write_json(tmp_path / "corrected.json", {**document, **broken})
+        with pytest.raises(InputError, match=rf"corrected\.json: is not as `diagnose` writes it .*{said}"):
+            predict(tmp_path, record(0))
 
 
 def test_the_bayes_factor_is_that_of_two_gaussians():

@@ -148,6 +148,18 @@ REFUSED = {
         chain_of(HINGE, after='<actuator><motor name="m" joint="second" armature="0.1"/></actuator>'),
         "actuator 'm' has armature or damping of its own",
     ),
+    "a damping that is none": (
+        chain_of('<joint name="d" damping="nan"/>'),
+        "body 'two' with joint 'd': the damping is no finite number",
+    ),
+    "a place that is none": (
+        chain_of(HINGE).replace("0 0 0.3", "0 nan 0"),
+        "body 'two' with joint 'second': the place is no finite number",
+    ),
+    "gravity that is none": (
+        chain_of(HINGE).replace("<worldbody>", '<option gravity="0 0 nan"/><worldbody>'),
+        "gravity is no finite number",
+    ),
     "an unknown attribute": (
         "<mujoco>\n<worldbody>\n<body foo='1'/>\n</worldbody></mujoco>",
         "unrecognized attribute: 'foo' (Element 'body', line 3)",
@@ -175,7 +187,8 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("text", "reason"), REFUSED.values(), ids=REFUSED.keys())
-def test_what_no_serial_arm_represents_is_refused_in_one_sentence(text, reason, tmp_path):
+def test_what_no_serial_arm_represents_is_refused_in_one_sentence(text, reason, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     file = tmp_path / "arm.xml"
     file.write_text(text)
     with pytest.raises(InputError) as refusal:
@@ -184,6 +197,7 @@ def test_what_no_serial_arm_represents_is_refused_in_one_sentence(text, reason, 
     assert str(file) in message
     assert reason in message
     assert "\n" not in message
+    assert list(tmp_path.iterdir()) == [file]  # MuJoCo left a log of its warnings there
 
 
 @pytest.mark.parametrize(

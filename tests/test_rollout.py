@@ -9,6 +9,7 @@ import json
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -24,7 +25,7 @@ from jaxpanda.effects.load import Payload, PayloadChange
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TorqueOffset
 from jaxpanda.effects.unknown import Unknown, UnknownAt, UnknownOfTwo
-from jaxpanda.mjcf import from_document
+from jaxpanda.mjcf import from_document, move_standard
 from jaxpanda.recordings import Recording, save
 from jaxpanda.simulation import JointFriction, Sensors, fourier_trajectory, simulate
 
@@ -184,6 +185,15 @@ def test_the_engine_s_model_has_the_numbers_of_the_arm():
         jnp.array([0.3, -0.8]), jnp.array([0.5, 1.0]), jnp.array([-2.0, 4.0])
     )
     np.testing.assert_allclose(data.qfrc_inverse, rigid - found.native.frictionloss, atol=1e-9)
+
+
+def test_a_link_that_cannot_be_leaves_nothing_where_it_was_called(tmp_path, monkeypatch):
+    """MuJoCo's warning of its inertia went to the terminal and into MUJOCO_LOG.TXT there."""
+    monkeypatch.chdir(tmp_path)
+    arm, source = two_links()
+    less = jnp.asarray(move_standard(-source.standard[1], np.eye(3), np.zeros(3))).at[0].set(-1e-9)
+    rollout.engine_model(source, eqx.tree_at(lambda a: a.standard, arm, arm.standard.at[1].add(less)))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_body_is_taken_up_and_a_push_is_felt_in_the_recording_they_happened_in(moved):

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from .. import files, markup
 from .. import signals as signals_
 from ..arm import Arm
-from ..corrected import FILE, SCHEMA, XML, Corrected
+from ..corrected import FILE, XML, Corrected, read
 from ..errors import InputError, require_x64
 from ..export import edit_mjcf, missing_assets, panda_mjcf, write_document, write_parameters
 from ..mjcf import MjcfSource, from_document, from_mjcf
@@ -425,14 +425,10 @@ def predict(folder: str | Path, motion: str | Path | Recording) -> Float[np.ndar
         InputError: no saved diagnosis in the folder, or a motion of another arm.
     """
     require_x64("a prediction")
-    path = Path(folder) / FILE
-    document = files.read_json(path)
-    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
-        raise InputError(f"{path}: is no corrected model; --diagnosis needs a folder that `diagnose` wrote")
-    corrected = Corrected.from_json(document)
+    corrected, noise = read(folder)
     recording = motion if isinstance(motion, Recording) else load(motion)
     recording.require_dof(corrected.arm.dof)
-    trace = prepare(recording, corrected.arm, whole=True, noise=np.asarray(document["torque_noise"]))
+    trace = prepare(recording, corrected.arm, whole=True, noise=noise)
     tau = corrected.measured_torque(trace.motion, trace.channels, trace.sign)
     grid = trace.motion.time
     return np.stack([np.interp(recording.time, grid, column) for column in tau.T], 1)
