@@ -25,6 +25,8 @@ DERIVATIVE_CUTOFF = 25.0
 """Low-pass of q before it is differentiated [Hz], where the rate allows it."""
 LONGEST_GAP = 0.1
 """Rows missing for longer than this [s] are bridged, but nothing near the bridge is kept."""
+STILL = 3e-3
+"""Travel below which a joint stands still in a recording [rad or m]."""
 REPEATS = 0.02
 """A motion repeats where q differs by less than this share of its own spread (rms)."""
 _ORDER = 4  # of the Butterworth filter, before it runs back over its output

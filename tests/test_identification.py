@@ -308,6 +308,19 @@ def test_an_option_that_does_not_exist_is_refused(change, message):
         identify(virtual(panda(), 3.0), panda(), **change)
 
 
+def test_a_stuck_sensor_and_an_arm_at_rest_are_refused():
+    """Both ended well, with coefficients of 1e-24 or friction that undid the model's own."""
+    moving = virtual(panda(), 3.0)
+    stuck = dataclasses.replace(moving, tau=np.where(np.arange(7) == 2, 1.0, moving.tau))
+    with pytest.raises(InputError, match=r"virtual\.csv: column tau_3 never changes while its joint moves"):
+        identify([moving, stuck], panda())
+    still = dataclasses.replace(
+        moving, q=moving.q[:1] + 1e-5 * np.random.default_rng(0).normal(size=moving.q.shape)
+    )
+    with pytest.raises(InputError, match=r"virtual\.csv: no joint moves"):
+        identify(still, panda())
+
+
 def test_a_motion_without_torque_is_refused():
     with pytest.raises(InputError, match="needs the measured torque"):
         identify(dataclasses.replace(virtual(panda(), 3.0), tau=None), panda())

@@ -45,8 +45,6 @@ _RINGING = 0.2
 """Share of it with which the filter of q still rings a period of its cutoff away."""
 _FROZEN, _MOVES = 0.1, 5.0
 """Torque that repeats itself for so long [s], while it must change by so many noises, is stuck."""
-_STILL = 3e-3
-"""Travel below which a joint stands still in a recording [rad]."""
 _BESIDE = 0.02
 """How far the low-pass of the torque and the noise model carry a wrong sign [s]."""
 _AT_ONCE = 24
@@ -212,7 +210,7 @@ def prepare(
         unsure = np.hypot(unsure, (np.abs(motion.mass) @ cut_off[:, :, None])[:, :, 0])
         trust = 1 / np.sqrt(1 + (unsure / np.maximum(noise, 1e-12)) ** 2)
         if not whole:
-            trust[:, np.ptp(motion.q, axis=0) < _STILL] = 0.0
+            trust[:, np.ptp(motion.q, axis=0) < signals_.STILL] = 0.0
     stuck = ()
     if recording.tau is not None and noise is not None and not whole:
         stuck = _stuck(recording.time, recording.tau, motion, noise)

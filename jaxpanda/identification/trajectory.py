@@ -15,7 +15,7 @@ from ..feasible import Bounds, Constraint
 from ..friction import LINEAR, MODELS, Friction, check_model
 from ..parameters import Base, arm_base_parameters
 from ..recordings import Recording
-from ..signals import Signals, blocks_many, prepare, repeatability
+from ..signals import STILL, Signals, blocks_many, prepare, repeatability
 from .one_step import PRIOR, Prior, feasible_least_squares
 from .regression import Fit, Masks, Regression, everything, excited, least_squares, regression, triangle
 from .result import RELIABLE, Identification, check_folds, of_model
@@ -81,6 +81,7 @@ def identify(
     if not recordings:
         raise InputError("recordings: none given; identification needs at least one")
     signals = [prepare(recording, cutoff=cutoff) for recording in recordings]
+    _check_alive(recordings, signals, friction)
     problem = _pose(signals, arm, friction, weighting)
     if method == "one_step":
         bounds = bounds or (Bounds.panda() if arm.name == "panda" else Bounds.around(arm))
@@ -116,6 +117,26 @@ def identify(
             "period": [s.period for s in signals],
         },
     )
+
+
+def _check_alive(recordings: Sequence[Recording], signals: Sequence[Signals], friction: str) -> None:
+    """Refuse a torque sensor that is stuck, and friction where nothing moves.
+
+    At rest friction may carry any load; without any, one pose tells as much of gravity as it shows.
+    """
+    moves = [np.ptp(s.q[s.keep], axis=0) >= STILL for s in signals]
+    for recording, moving in zip(recordings, moves, strict=True):
+        constant = recording.tau is not None and np.ptp(recording.tau, axis=0) == 0
+        if np.any(stuck := moving & constant):
+            raise InputError(
+                f"{recording.name}: column tau_{np.argmax(stuck) + 1} never changes while its joint moves, where"
+                " measured torque is needed"
+            )
+    if friction != "none" and not np.any(moves):
+        raise InputError(
+            f"{', '.join(s.name for s in signals)}: no joint moves; friction at rest may carry any load, so that"
+            " identification needs motion"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
