@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .. import report
+from ..corrected import XML
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_folder, write_text
@@ -61,7 +62,8 @@ def diagnose_files(
         given += [("recording", p) for p in recordings] + [("reference", p) for p in reference]
         names = {r.path: r.name for r in every}
         sources = tuple(_source(role, path, names) for role, path in given)
-        notes = (*found.notes, *missing_assets(found.written, out))
+        missing = (f"{XML}: {what}" for what in missing_assets(found.written, out))
+        notes = (*found.notes, *missing)
         found = _replayed(dataclasses.replace(found, sources=sources, notes=notes), suspect)
         report.to_html("jaxpanda: diagnosis", page.sections(found), folder / "report.html")
         found.save(out)  # not by way of the other folder: what is included may belong outside of `out`
