@@ -29,7 +29,7 @@ DOUBT, CROWD = 6.0, 0.6
 beyond two in its `crowd`: who needs many laws has not met the right one."""
 MISLEADS, WANDERS = 0.1, 0.3
 """And for a law that predicts torque no better where it was not fitted; a drift, which goes on as it likes, is
-doubted less for that."""
+doubted less for that, and so is what happened once, most of it in a joint where another law does so."""
 MEANT, AS_CLEAR = 0.05, 0.1
 """Share of a term's torque from which it counts among the laws of a joint; share of a term's evidence from which
 another's is about as clear."""
@@ -69,6 +69,11 @@ def findings(problem: Problem, state: State, lost: Sequence[bool]) -> list[Findi
     doubt = doubt * np.exp(-DOUBT * where @ left)
     drifts = [hasattr(t.effect, "until") for t in state.terms]
     doubt = doubt * np.where(lost, np.where(drifts, WANDERS, MISLEADS), 1.0)
+    misled = sorted({int(where[i].argmax()) for i in np.flatnonzero(lost)})
+    for group in groups:
+        once = [i for i in group if state.terms[i].effect.bound_to_recording]
+        if any(where[i, misled].sum() > 0.5 for i in once):
+            doubt[once] *= WANDERS
     spread = covariances(problem, state)
     out = [_finding(problem, state, group, names[group[0]], rivals, doubt, spread) for group in groups]
     out = unnamed_where_doubtful(problem, state, out)
