@@ -117,6 +117,7 @@ def numbers(
         if not joints:
             continue
         whole = value.ndim > 1  # links beyond a joint act in it
+        strongest = max(joints, key=lambda j: power[j])
         parts = ((j, value[j, 0], std[j, 0]) if whole else (j, value[j], std[j]) for j in range(problem.dof))
         out.append(
             Finding(
@@ -135,8 +136,8 @@ def numbers(
                 rms_torque=np.sqrt(power),
                 evidence=float(0.5 * len(weights) * np.sum(power / state.noise.std**2)),
                 summary=f"The simulation's own numbers are not this arm's ({name.replace('_', ' ')}): refitted"
-                f" together they explain up to {np.sqrt(power.max()):.3g} N·m rms, at joint"
-                f" {int(power.argmax()) + 1}. Torque sensors of a wrong scale could look alike.",
+                f" together they explain {np.sqrt(power[strongest]):.3g} N·m rms at joint {strongest + 1}."
+                " Torque sensors of a wrong scale could look alike.",
                 terms=(),
             )
         )
