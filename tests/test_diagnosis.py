@@ -19,7 +19,7 @@ from jaxpanda import Arm, InputError, Recording, markup
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
 from jaxpanda.diagnosis.decide import titles
-from jaxpanda.diagnosis.diagnosis import _corrected_xml
+from jaxpanda.diagnosis.diagnosis import _written
 from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check, inertial_spread
@@ -257,7 +257,8 @@ def _with(*effects):
     arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", Path("panda.xml")))
     zeros = jnp.zeros(7)
     c = tuple(jnp.array([0.2, 0.1]) for _ in effects)
-    return _corrected_xml(source, Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, effects, c))
+    document, notes = _written(source, Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, effects, c))
+    return document.text, notes
 
 
 def test_friction_that_sticks_is_mujoco_s_frictionloss():
