@@ -219,6 +219,7 @@ def diagnose(
     found = tuple(findings(problem, state, lost))
     contradicted = premises.knowledge != knowledge
     wrong = numbers(problem, state, premises.changes) if contradicted and not found else []
+    found = (*found, *wrong)
     corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
     if any(lost):
         dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
@@ -231,8 +232,8 @@ def diagnose(
     written, warnings = _written(source, corrected if wrong else corrected.as_written)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
-        verdict=_verdict((*found, *wrong), partly(state)),
-        findings=(*found, *wrong),
+        verdict=_verdict(found, partly(state)),
+        findings=found,
         fit=fit(problem, kept),
         corrected=corrected,
         written=written,
@@ -268,9 +269,7 @@ def _still(trace: Trace) -> list[str]:
 
 def _turned(problem: Problem, state: State) -> list[str]:
     """A sentence about the joints whose known friction turns otherwise than MuJoCo's, beyond the noise."""
-    stop = problem.nuisance[0].shape[2] - sum(len(t.deviation) for t in problem.background)
-    stop -= problem.traces[0].shaken.shape[2]
-    at = slice(stop - problem.traces[0].turning.shape[2], stop)
+    at = problem.turning
     torque = np.concatenate([N[:, :, at] @ state.design.x[at] for N in problem.nuisance])
     joints = [str(j + 1) for j in np.flatnonzero(np.mean(torque**2, 0) > BEYOND * state.noise.std**2)]
     if not joints:

@@ -1,7 +1,7 @@
 """Scans over what the grids cannot hold: windows in time, and orders of ripple."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 import scipy.linalg
@@ -11,7 +11,7 @@ from ..effects import AbstractEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import TorqueRipple
 from ..effects.load import EVER, PayloadChange
-from ..effects.unknown import UnknownAt
+from ..effects.unknown import SIGN_WIDTH, UnknownAt
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes, log_mean_exp
 from .host import parallel
 from .problem import Problem
@@ -63,7 +63,8 @@ def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]
         orders = np.arange(slowest(travel), highest, step)
         if not len(orders):
             return None
-        b, G = problem.projected(
+        top, evidence, best, deviation = _likeliest(
+            problem,
             "ripple",
             lambda: [
                 np.stack([np.sin(x[:, None] * orders), np.cos(x[:, None] * orders)], 2) * on
@@ -73,15 +74,8 @@ def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]
             design,
             j,
         )
-        deviation = np.full((len(orders), 2), noise.std[j] * np.sqrt(2))
-        score, scale = log_bayes(b, G, deviation, SCALES)
-        top = int(score.argmax())
         return Proposal(
-            TorqueRipple(j, float(orders[top]), "one"),
-            float(log_mean_exp(score)),
-            float(score[top]),
-            deviation[top] * scale[top],
-            (0.4 * step / orders[top],),
+            TorqueRipple(j, float(orders[top]), "one"), evidence, best, deviation, (0.4 * step / orders[top],)
         )
 
     return [p for p in parallel(one, joints) if p is not None]
@@ -94,35 +88,43 @@ def spots(problem: Problem, design: Design, noise: Noise, joints: Iterable[int])
         q = [t.motion.q[:, j] for t in problem.traces]
         low, high = np.quantile(np.concatenate(q), (0.005, 0.995))
         widths = [max(w, (high - low) / _PLACES) for w in _SPOTS]
-        effects = [
-            UnknownAt(j, place=float(at), width=w) for w in widths for at in np.arange(low + w, high - w, w)
-        ]
-        if not effects:
+        tried = [(at, w) for w in widths for at in np.arange(low + w, high - w, w)]
+        if not tried:
             return None
-        place, width = (np.array([float(getattr(e, name)) for e in effects]) for name in ("place", "width"))
+        place, width = np.transpose(tried)
 
         def columns() -> list[np.ndarray]:
             out = []
             for trace, on in zip(problem.traces, problem.active, strict=True):
                 x = (trace.motion.q[:, j, None] - place) / width
-                sign = np.tanh(trace.motion.qd[:, j, None] / effects[0].v0)
+                sign = np.tanh(trace.motion.qd[:, j, None] / SIGN_WIDTH)
                 bump = np.exp(-0.5 * x**2) * on
                 out.append(np.stack([bump, x * bump, sign * bump], 2))
             return out
 
-        b, G = problem.projected("spots", columns, noise, design, j)
-        deviation = np.full((len(effects), 3), noise.std[j] * np.sqrt(2))
-        score, scale = log_bayes(b, G, deviation, SCALES)
-        top = int(score.argmax())
-        return Proposal(
-            effects[top],
-            float(log_mean_exp(score)),
-            float(score[top]),
-            deviation[top] * scale[top],
-            (0.4 * float(width[top]), 0.3),
-        )
+        top, evidence, best, deviation = _likeliest(problem, "spots", columns, noise, design, j)
+        effect = UnknownAt(j, place=float(place[top]), width=float(width[top]))
+        return Proposal(effect, evidence, best, deviation, (0.4 * float(width[top]), 0.3))
 
     return [p for p in parallel(one, joints) if p is not None]
+
+
+def _likeliest(
+    problem: Problem,
+    key: str,
+    columns: Callable[[], list[np.ndarray]],
+    noise: Noise,
+    design: Design,
+    joint: int,
+) -> tuple[int, float, float, Float[np.ndarray, " n"]]:
+    """Of shapes of a size that only the noise tells: which is likeliest, the evidence averaged over all, its own,
+    and the prior deviations of its coefficients. `columns` are those of all shapes, as `Problem.projected` has
+    them."""
+    b, G = problem.projected(key, columns, noise, design, joint)
+    deviation = np.full(b.shape, noise.std[joint] * np.sqrt(2))
+    score, scale = log_bayes(b, G, deviation, SCALES)
+    top = int(score.argmax())
+    return top, float(log_mean_exp(score)), float(score[top]), deviation[top] * scale[top]
 
 
 def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal]:

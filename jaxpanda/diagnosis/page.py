@@ -256,45 +256,27 @@ def _regime(found: Diagnosis, effect: AbstractEffect | None, joint: int, against
     traces, unit = found.problem.traces, found.problem.arm.unit
     source = int(getattr(effect, "source", joint))
     what = against.split(",")[0]
-    label, part = {
-        "velocity": (
-            f"velocity of joint {joint + 1} [{unit('rad/s', joint)}]",
-            lambda t: t.motion.qd[:, joint],
-        ),
-        "position": (f"position of joint {joint + 1} [{unit('rad', joint)}]", lambda t: t.motion.q[:, joint]),
-        "acceleration": (
-            f"acceleration of joint {joint + 1} [{unit('rad/s²', joint)}]",
-            lambda t: t.motion.qdd[:, joint],
-        ),
-        "load": (f"load on joint {joint + 1} [{unit('N·m', joint)}]", lambda t: t.motion.load[:, joint]),
-        "|load|": (
-            f"size of the load on joint {joint + 1} [{unit('N·m', joint)}]",
-            lambda t: np.abs(t.motion.load[:, joint]),
-        ),
-        "model torque": (
-            f"torque of the model at joint {joint + 1} [{unit('N·m', joint)}]",
-            lambda t: t.motion.torque[:, joint],
-        ),
-        "source torque": (
-            f"torque of the model at joint {source + 1} [{unit('N·m', source)}]",
-            lambda t: t.motion.torque[:, source],
-        ),
-        "source position": (
-            f"position of joint {source + 1} [{unit('rad', source)}]",
-            lambda t: t.motion.q[:, source],
-        ),
-        "source velocity": (
-            f"velocity of joint {source + 1} [{unit('rad/s', source)}]",
-            lambda t: t.motion.qd[:, source],
-        ),
-        "first joint": (f"position of joint 1 [{unit('rad', 0)}]", lambda t: t.motion.q[:, 0]),
-        "reversal": (
-            f"distance since the last reversal [{unit('rad', joint)}]",
-            lambda t: np.where(since_reversal(t, joint) > 0.2, np.nan, since_reversal(t, joint)),
-        ),
-        "time": ("time [s]", lambda t: t.motion.time),
-    }[what]
-    x = [np.asarray(part(t)) for t in traces]
+    if what == "time":
+        label, x = "time [s]", [t.motion.time for t in traces]
+    elif what == "reversal":
+        label = f"distance since the last reversal [{unit('rad', joint)}]"
+        since = [since_reversal(t, joint) for t in traces]
+        x = [np.where(one > 0.2, np.nan, one) for one in since]
+    else:
+        words, turning, at, channel = {
+            "velocity": ("velocity of", "rad/s", joint, lambda m: m.qd),
+            "position": ("position of", "rad", joint, lambda m: m.q),
+            "acceleration": ("acceleration of", "rad/s²", joint, lambda m: m.qdd),
+            "load": ("load on", "N·m", joint, lambda m: m.load),
+            "|load|": ("size of the load on", "N·m", joint, lambda m: np.abs(m.load)),
+            "model torque": ("torque of the model at", "N·m", joint, lambda m: m.torque),
+            "source torque": ("torque of the model at", "N·m", source, lambda m: m.torque),
+            "source position": ("position of", "rad", source, lambda m: m.q),
+            "source velocity": ("velocity of", "rad/s", source, lambda m: m.qd),
+            "first joint": ("position of", "rad", 0, lambda m: m.q),
+        }[what]
+        label = f"{words} joint {at + 1} [{unit(turning, at)}]"
+        x = [np.asarray(channel(t.motion)[:, at]) for t in traces]
     turned = [
         np.sign(t.motion.qd[:, joint]) if "turned" in against else np.ones(t.motion.samples) for t in traces
     ]

@@ -98,11 +98,22 @@ class Problem:
             out.append(dataclasses.replace(c, columns=columns))
         return out
 
+    @property
+    def shaken(self) -> slice:
+        """Where the nuisance has the encoders' noise."""
+        stop = self.nuisance[0].shape[2] - sum(len(t.deviation) for t in self.background)
+        return slice(stop - self.traces[0].shaken.shape[2], stop)
+
+    @property
+    def turning(self) -> slice:
+        """Where the nuisance has how known friction turns."""
+        stop = self.shaken.start
+        return slice(stop - self.traces[0].turning.shape[2], stop)
+
     def explained(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """The coefficients less those of the encoders' noise, which belongs to a recording and to no model."""
-        stop = self.nuisance[0].shape[2] - sum(len(t.deviation) for t in self.background)
         x = x.copy()
-        x[stop - self.traces[0].shaken.shape[2] : stop] = 0.0
+        x[self.shaken] = 0.0
         return x
 
     def term(self, effect: AbstractEffect, deviation: Float[np.ndarray, " n"]) -> Term:

@@ -20,7 +20,8 @@ from .effect import (
 )
 from .motion import Channels, Joint
 
-_WIDTH = 0.01
+SIGN_WIDTH = 0.01
+"""Velocity over which friction without a law changes sign [rad/s]."""
 FORMS = {
     "odd in dq": "an odd function of the joint's velocity",
     "even in dq": "an even function of the joint's velocity",
@@ -79,7 +80,7 @@ class Unknown(AbstractInstantEffect):
 
     @property
     def dry_width(self) -> Array | float | None:
-        return _WIDTH if self._odd and self.form != "odd in dq_k" else None
+        return SIGN_WIDTH if self._odd and self.form != "odd in dq_k" else None
 
     @property
     def feels(self) -> Literal["motion", "load", "acceleration"]:
@@ -109,12 +110,12 @@ class Unknown(AbstractInstantEffect):
         if not self._odd:
             return self._hats(s)
         source = self.source if self.form == "odd in dq_k" else self.joint
-        return self._hats(s) * smooth_sign(s.qd[source], _WIDTH)
+        return self._hats(s) * smooth_sign(s.qd[source], SIGN_WIDTH)
 
     def resist(self, c, arm, z, s, dt):
         if self.dry_width is None:
             return super().resist(c, arm, z, s, dt)
-        damping = self._hats(s) @ c * sign_over_velocity(s.qd[self.joint], _WIDTH)
+        damping = self._hats(s) @ c * sign_over_velocity(s.qd[self.joint], SIGN_WIDTH)
         return Resistance(jnp.zeros_like(s.q), self._here(damping, s), z)
 
     def parameters(self, c, covariance):
@@ -190,7 +191,7 @@ class UnknownAt(AbstractDryFriction):
     joint: Joint
     place: Float[Array, ""] | float
     width: Float[Array, ""] | float
-    v0: Float[Array, ""] | float = _WIDTH
+    v0: Float[Array, ""] | float = SIGN_WIDTH
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownAt"]:
