@@ -9,16 +9,29 @@ from helpers import record
 
 from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict
-from jaxpanda.diagnosis.decide import UNLIKELY, WANDERS, findings, unnamed_where_doubtful
+from jaxpanda.diagnosis.decide import UNLIKELY, WANDERS, crowd, findings, unnamed_where_doubtful
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.next_motion import next_motion
 from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.search import ACCEPT, SHADOW, floors, grids, handicapped, refine, start, with_terms
+from jaxpanda.diagnosis.search import (
+    ACCEPT,
+    SHADOW,
+    floors,
+    grids,
+    handicapped,
+    helped_over,
+    is_of_time,
+    most_helpful,
+    ranked,
+    refine,
+    start,
+    with_terms,
+)
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.drive import JointSpring
 from jaxpanda.effects.friction import CoulombFriction
-from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.effects.sensing import TorqueDrift, TorqueOffset
 from jaxpanda.effects.unknown import Unknown
 
 
@@ -121,6 +134,65 @@ def test_a_curve_of_another_joint_s_motion_stands_in_that_joint_s_shadow():
         SHADOW * 1e5, rel=1e-6
     )
     assert floors(with_terms(problem, [friction, own]), gained)[1] == pytest.approx(ACCEPT)
+
+
+@pytest.mark.parametrize(
+    ("bias", "drifts"),
+    [
+        (lambda t: np.cos(2 * np.pi * t / 10), False),  # the motion's own period
+        (lambda t: np.cos(2 * np.pi * t / 16), True),
+        (lambda t: 0.1 * t, True),
+    ],
+)
+def test_what_comes_again_with_the_motion_is_no_drift(bias, drifts):
+    there = lambda t, q, qd, qdd: 0.3 * bias(t)[:, None] * np.eye(7)[0]
+    problem = posed(record(5, there, seconds=20.0))
+    assert problem.traces[0].signals.period == pytest.approx(10.0, abs=0.05)
+    state = start(problem)
+    library = [g for g in problem.library if (g.name, g.joint) == ("torque_drift", 0)]
+    (drift,) = grids(problem, state.design, state.noise, library)
+    drift = refine(problem, state.design, state.noise, drift)
+    assert isinstance(drift.effect, TorqueDrift)
+    assert drift.evidence > 10 * ACCEPT
+    assert is_of_time(problem, state.design, state.noise, drift) is drifts
+
+
+def test_friction_that_changes_from_one_repeat_to_the_next_is_a_drift_whatever_stays():
+    warms = lambda t, q, qd, qdd: (
+        ((0.8 - 0.01 * t)[:, None] * np.tanh(qd[:, [0]] / 0.01) + 0.3 * qd[:, [0]]) * np.eye(7)[0]
+    )
+    problem = posed(record(5, warms, seconds=20.0))
+    state = start(problem)
+    library = [g for g in problem.library if (g.name, g.joint) == ("friction_drift", 0)]
+    (drift,) = grids(problem, state.design, state.noise, library)
+    assert is_of_time(problem, state.design, state.noise, refine(problem, state.design, state.noise, drift))
+
+
+def test_one_cause_of_what_several_joints_show_comes_before_a_cause_for_each():
+    """A strong spring has more evidence than a base that leans, and is asked after it."""
+
+    def leans(t, q, qd, qdd):
+        columns = Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)).gravity_columns
+        return columns @ [0.15, -0.1, 0.0] + 4.0 * (q[:, [2]] - 0.1) * np.eye(7)[2]
+
+    problem = posed(record(5, leans), record(6, leans))
+    state = start(problem)
+    proposals = ranked(problem, state.design, state.noise)
+    by_name = {p.effect.name: p for p in reversed(proposals)}
+    assert by_name["joint_spring"].evidence > by_name["gravity_direction"].evidence
+    chosen = most_helpful(problem, state, proposals, lambda _: None)
+    assert chosen is not None
+    assert chosen.effect.name == "gravity_direction"
+    grown = with_terms(problem, [problem.term(chosen.effect, chosen.deviation)])
+    assert helped_over(problem, grown, state) > 100.0 > 0.0 > helped_over(problem, state, grown)
+
+
+def test_laws_of_single_joints_are_no_crowd_for_what_several_show_at_once():
+    where = np.array([[1.0, 0.0], [1.0, 0.0], [1.0, 0.0], [0.6, 0.4]])
+    names, evidence = ["ripple", "offset", "friction", "gravity_direction"], [200.0, 300.0, 400.0, 100.0]
+    found = crowd(where, names, evidence, [False, False, False, True])
+    np.testing.assert_allclose(found, [4, 4, 4, 1])
+    np.testing.assert_allclose(crowd(where, names, evidence, [False] * 4), 4)
 
 
 @pytest.mark.parametrize(("level", "left"), [(0.5, ["unknown"]), (0.02, [])])

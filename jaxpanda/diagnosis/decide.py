@@ -65,9 +65,10 @@ def findings(problem: Problem, state: State, lost: Sequence[bool]) -> list[Findi
         for i in group:
             if state.terms[i].effect.bound_to_recording:
                 each[i] = f"{names[i]} {k}"
-    doubt = CROWD ** np.maximum(0.0, crowd(where, each, [r[0] for r in rivals]) - 2)
+    wide = [len(t.effect.joints) > 1 for t in state.terms]
+    doubt = CROWD ** np.maximum(0.0, crowd(where, each, [r[0] for r in rivals], wide) - 2)
     doubt = doubt * np.exp(-DOUBT * where @ left)
-    drifts = [hasattr(t.effect, "until") for t in state.terms]
+    drifts = [t.effect.drifts for t in state.terms]
     doubt = doubt * np.where(lost, np.where(drifts, WANDERS, MISLEADS), 1.0)
     misled = sorted({int(where[i].argmax()) for i in np.flatnonzero(lost)})
     for group in groups:
@@ -186,18 +187,22 @@ def unnamed_where_doubtful(problem: Problem, state: State, found: Sequence[Findi
 
 
 def crowd(
-    where: Float[np.ndarray, "terms dof"], names: Sequence[str], evidence: Sequence[float]
+    where: Float[np.ndarray, "terms dof"],
+    names: Sequence[str],
+    evidence: Sequence[float],
+    wide: Sequence[bool],
 ) -> Float[np.ndarray, " terms"]:
     """How many effects stand beside each term, itself included: in its joints, or about as clear anywhere.
 
-    `where`: each term's shares of torque in the joints.
+    `where`: each term's shares of torque in the joints; `wide`: which of them are one cause of what several
+    joints show. Those stand beside their like only: what is left of a joint's own laws stays in that joint.
     """
     found = np.zeros(len(names))
     for i, joint in itertools.product(range(len(names)), range(where.shape[1])):
         beside = {
             name
-            for name, share, clear in zip(names, where[:, joint], evidence, strict=True)
-            if share > MEANT or clear >= AS_CLEAR * evidence[i]
+            for name, share, clear, one_cause in zip(names, where[:, joint], evidence, wide, strict=True)
+            if (share > MEANT or clear >= AS_CLEAR * evidence[i]) and (one_cause or not wide[i])
         }
         found[i] += where[i, joint] * len(beside)
     return found

@@ -379,8 +379,8 @@ def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) ->
         float(t.motion.time[-1]) for t, on in zip(problem.traces, problem.active, strict=True) if on
     )
     for i, term in enumerate(state.terms):
-        drifts = hasattr(term.effect, "until")  # nobody knows how it goes on
-        effects.append(dataclasses.replace(term.effect, until=recorded) if drifts else term.effect)
+        known = {"until": recorded} if term.effect.drifts else {}
+        effects.append(dataclasses.replace(term.effect, **known))
         values.append(jnp.asarray(coefficients(state, i)))
     return Corrected(
         arm, jnp.asarray(change), jnp.asarray(damping), jnp.asarray(level), tuple(effects), tuple(values)

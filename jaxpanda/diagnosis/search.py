@@ -13,8 +13,9 @@ from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import Backlash, JointElasticity, TorqueRipple
 from ..effects.effect import AbstractDryFriction
-from ..effects.friction import AsymmetricFriction
+from ..effects.friction import AsymmetricFriction, FrictionDrift
 from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
+from ..effects.sensing import TorqueDrift
 from ..effects.unknown import Unknown, UnknownOfTwo
 from .events import BIN, Proposal, ripple, slowest, spots, windows
 from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
@@ -75,7 +76,7 @@ _CLOSE = 0.5
 LIKELIER, ELECTIONS = 3.0, 3
 """How many times as likely a rival takes a term's place, and how often one does in a row."""
 CROWDED, BEGUN = 6, 50.0
-"""Terms from which another beginning is tried, and the evidence it must win by [nats]."""
+"""Terms from which another beginning is tried, and what it must win by where it was not fitted [nats]."""
 _SIMPLE = ("viscous_friction", "coulomb_friction", "presliding_hysteresis", "torque_offset")
 _BEGINNINGS = 2
 """Simpler effects from which a joint is built up again."""
@@ -83,6 +84,8 @@ _GIVEN = 0.2
 _PAID = 8.0  # [nats]: for the search of when a body changes hands
 CLEAR = 4.0
 """Standard deviations by which a gap must differ from none."""
+AFRESH = 0.1
+"""What of a drift differs at least between two repeats of a motion, as a share of what comes again."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,14 +131,30 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
     say("another beginning: friction and offset at all joints")
     other = with_terms(problem, everywhere(problem, state.noise))
     other = finish(problem, grow(problem, other, say, lasting=True), say)
+    helped = helped_over(problem, other, state)
     gained = gained_over(problem, other, state)
-    say(f"which brings {gained:.0f} over the other")
-    return other if gained > BEGUN else state
+    say(f"which brings {gained:.0f} over the other, and {helped:.0f} where it was not fitted")
+    return other if helped > BEGUN else state
 
 
 def gained_over(problem: Problem, state: State, other: State) -> float:
     """Evidence of a state over that of another, both in the first one's noise [nats]."""
     return state.design.log_evidence - problem.design(other.terms, state.noise).log_evidence
+
+
+def helped_over(problem: Problem, state: State, other: State) -> float:
+    """By how much half the squared error of a state, where it was not fitted, is below that of another [nats].
+
+    Both in the other's noise, and where neither has what happened once, which cannot be tested so.
+    """
+    here = State(state.terms, other.noise, problem.design(state.terms, other.noise))
+    counts = np.ones(len(other.design.residual[0]), bool)
+    for one in (here, other):
+        once = [t.effect.bound_to_recording for t in one.terms]
+        if any(once):
+            counts &= energies(one)[once].sum((0, 1)) <= 0
+    before, after = (problem.held_out_error(one.design, counts) for one in (other, here))
+    return 0.5 * (before - after)
 
 
 def elected(problem: Problem, state: State, say: Any) -> State:
@@ -176,7 +195,7 @@ def everywhere(problem: Problem, noise: Noise) -> list[Term]:
 def grow(problem: Problem, state: State, say: Any, *, lasting: bool = False) -> State:
     """Add the likeliest effect while one has evidence; only what does not happen once, if `lasting`."""
     proposals, joints = [], None
-    most = max(MOST_TERMS, len(state.terms) + MOST_ADDED)
+    most = max(MOST_TERMS, len(state.terms) + MOST_ADDED * (1 + lasting))
     most_names = MOST_NAMES + len({t.effect.name for t in state.terms})
     while len(state.terms) < most:
         proposals = ranked(problem, state.design, state.noise, joints, proposals)
@@ -184,8 +203,11 @@ def grow(problem: Problem, state: State, say: Any, *, lasting: bool = False) -> 
         held, names = {t.key for t in state.terms}, {t.effect.name for t in state.terms}
         new = [p for p in proposals if p.key not in held or p.effect.repeats]
         new = [p for p in new if p.key[0] in names or len(names) < most_names]
-        new = [p for p in new if not (lasting and p.effect.bound_to_recording)]
-        worthy = next((p for p in new[:_TRIED] if is_worthy(problem, state, p, say)), None)
+        if lasting:
+            new = [p for p in new if not p.effect.bound_to_recording]
+            worthy = most_helpful(problem, state, new, say)
+        else:
+            worthy = next((p for p in new[:_TRIED] if is_worthy(problem, state, p, say)), None)
         if worthy is None:
             break
         state = with_terms(problem, (*state.terms, problem.term(worthy.effect, worthy.deviation)))
@@ -229,6 +251,29 @@ def is_worthy(problem: Problem, state: State, proposal: Proposal, say: Any) -> b
     if evidence < least:
         say(f"{describe([proposal])} brings {evidence:.0f}, less than {least:.0f}: a shadow")
     return bool(evidence >= least)
+
+
+def most_helpful(problem: Problem, state: State, proposals: Sequence[Proposal], say: Any) -> Proposal | None:
+    """Of the worthy proposals with about as much evidence as any, the one that helps most where not fitted.
+
+    Beside many laws a free curve may have most evidence and mislead. One cause of what several joints show comes
+    before a cause for each. None if none helps.
+    """
+    reference = problem.held_out_error(state.design)
+
+    def likeliest(some: Sequence[Proposal]) -> Proposal | None:
+        helped = []
+        for p in some:
+            if is_worthy(problem, state, p, say):
+                terms = (*state.terms, problem.term(p.effect, p.deviation))
+                gained = reference - problem.held_out_error(problem.design(terms, state.noise))
+                helped += [(gained, p)] if gained > HELD_OUT else []
+        most = max((p.evidence for _, p in helped), default=0.0)
+        close = [pair for pair in helped if pair[1].evidence >= _CLOSE * most]
+        return max(close, key=lambda pair: pair[0])[1] if close else None
+
+    wide = [p for p in proposals if len(p.effect.joints) > 1]
+    return likeliest(wide) or likeliest([p for p in proposals[:_TRIED] if len(p.effect.joints) == 1])
 
 
 def settle(problem: Problem, state: State) -> State:
@@ -512,7 +557,8 @@ def _own(
         return None
     evidence = best - _PAID if found is None else found.evidence + best - found.best
     own = Proposal(effect, evidence, best, deviation, first_steps(effect))
-    stands = is_dissipative(problem, rest, noise, own) and has_play(problem, rest, noise, own)
+    tests = is_dissipative, has_play, is_of_time
+    stands = all(test(problem, rest, noise, own) for test in tests)
     return own if stands and is_event(problem, effect) else None
 
 
@@ -578,6 +624,7 @@ def ranked(
     refined = parallel(lambda p: refine(problem, design, noise, p), order[:close])
     refined = [p for p in refined if is_dissipative(problem, design, noise, p)]
     found = [p for p in (*refined, *order[close:]) if has_play(problem, design, noise, p)]
+    found = [p for p in found if is_of_time(problem, design, noise, p)]
     return sorted((p for p in found if is_event(problem, p.effect)), key=lambda p: -p.evidence)
 
 
@@ -622,6 +669,35 @@ def has_play(problem: Problem, design: Design, noise: Noise, proposal: Proposal)
         return True
     c, covariance = _fitted(problem, design, noise, proposal)
     return bool(c[0] > CLEAR * np.sqrt(covariance[0, 0]))
+
+
+def is_of_time(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
+    """Whether what calls itself a drift tells one repeat of a motion from the next, where there are repeats.
+
+    What comes again with the motion, and is no steady law of the drift's kind, is some function of the motion.
+    """
+    effect = proposal.effect
+    if not isinstance(effect, TorqueDrift | FrictionDrift) or proposal.evidence < ACCEPT:
+        return True
+    shifts = [round(t.signals.period / t.motion.dt) if t.signals.period else 0 for t in problem.traces]
+    if not any(shifts):
+        return True
+    j, (c, _) = effect.joints[0], _fitted(problem, design, noise, proposal)
+    whitened = lambda one: problem.whitened(problem.columns([one]), noise, j)[:, 0]
+    steady = [whitened(law) for law in effect.steady]
+    parts = np.column_stack([design.left[j], whitened(effect) @ c, *steady])
+    ends = np.cumsum([t.motion.samples for t in problem.traces])
+    apart, alike = [np.zeros((0, parts.shape[1]))], [np.zeros((0, parts.shape[1]))]
+    for part, trace, shift in zip(np.split(parts, ends[:-1]), problem.traces, shifts, strict=True):
+        if 0 < shift < len(part):
+            counts = (trace.weights[shift:, j] > 0) & (trace.weights[:-shift, j] > 0)
+            apart.append((part[shift:] - part[:-shift])[counts])
+            alike.append(0.5 * (part[shift:] + part[:-shift])[counts])
+    left, drift, *_ = np.concatenate(apart).T
+    told = 0.25 * float(left @ left - (left - drift) @ (left - drift))
+    _, drift, *steady = np.concatenate(alike).T
+    law = np.column_stack(steady)
+    return told >= AFRESH * float(np.sum((drift - law @ np.linalg.lstsq(law, drift)[0]) ** 2))
 
 
 def _fitted(

@@ -85,6 +85,9 @@ class AbstractEffect(eqx.Module):
     show (`shift`), or what the torque sensors show (`sensed`)."""
     takes_shown: ClassVar[bool] = False
     """Whether it is a function of torque that the sensors show, and so of every other effect."""
+    drifts: ClassVar[bool] = False
+    """Whether it changes with the clock; then its field `until` is the end of what was recorded [s], after which
+    nobody knows how it goes on."""
     bound_to_recording: ClassVar[bool] = False
     """Whether it happened at some time in a recording; `placed` says what that means for others."""
 

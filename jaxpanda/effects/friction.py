@@ -327,6 +327,7 @@ class FrictionDrift(AbstractDryFriction):
         "load_dependent_friction",
         "torque_drift",
     )
+    drifts: ClassVar[bool] = True
 
     joint: Joint
     time_constant: Float[Array, ""] | float
@@ -343,6 +344,14 @@ class FrictionDrift(AbstractDryFriction):
             for T in (2.0, 6.0, 20.0, 300.0)
             for v0 in ((0.005, 0.03) if form.startswith("level") else (0.01,))
             for j in range(arm.dof)
+        ]
+
+    @property
+    def steady(self) -> tuple[AbstractDryFriction | ViscousFriction, ...]:
+        """The friction that does not change."""
+        level, slope = CoulombFriction(self.joint, self.v0), ViscousFriction(self.joint)
+        return {"level": (level,), "slope": (slope,), "both": (level, slope)}[
+            self.form.removesuffix(" extra")
         ]
 
     def variants(self, arm: Arm) -> Sequence["FrictionDrift"]:

@@ -101,6 +101,7 @@ class TorqueDrift(AbstractInstantEffect):
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0),)
     reveals: ClassVar[str] = "the same poses early and late"
     confounded_with: ClassVar[tuple[str, ...]] = ("payload_change", "friction_drift", "torque_offset")
+    drifts: ClassVar[bool] = True
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
@@ -113,6 +114,11 @@ class TorqueDrift(AbstractInstantEffect):
         shapes = [(form, T) for form in ("extra", "offset") for T in (2.0, 6.0, 20.0, 500.0)]
         shapes += [(form, T) for form in ("wave", "wandering") for T in (6.0, 10.0, 16.0, 30.0, 60.0)]
         return [cls(j, T, form) for form, T in shapes for j in range(arm.dof)]
+
+    @property
+    def steady(self) -> tuple[TorqueOffset, ...]:
+        """The bias that does not change."""
+        return (TorqueOffset(self.joint),)
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
