@@ -252,26 +252,47 @@ def test_friction_over_a_hair_s_breadth_is_coulomb_s():
     assert called(PreslidingHysteresis(2, 0.003, "dahl whole")) == "presliding_hysteresis"
 
 
-def _with(*effects):
-    """The Panda's file with presliding friction of 0.2 and 0.1 N m put in, and what it cannot hold."""
+@pytest.fixture(scope="module")
+def written():
+    """The Panda's file with a change of its links put in, and effects of 0.2 and 0.1; and what it cannot hold."""
     arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", Path("panda.xml")))
-    zeros = jnp.zeros(7)
-    c = tuple(jnp.array([0.2, 0.1]) for _ in effects)
-    document, notes = _written(source, Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, effects, c))
-    return document.text, notes
+    problem = pose((prepare(record(0), arm),), (True,), "exact").problem
+
+    def of(*effects, change=0.0):
+        zeros, c = jnp.zeros(7), tuple(jnp.array([0.2, 0.1]) for _ in effects)
+        document, notes = _written(
+            source, Corrected(arm, jnp.zeros((7, 10)) + change, zeros, zeros, effects, c), problem
+        )
+        return document, notes
+
+    return of
 
 
-def test_friction_that_sticks_is_mujoco_s_frictionloss():
+def test_friction_that_sticks_is_mujoco_s_frictionloss(written):
     """It was named Coulomb's, and corrected.xml had nothing of it."""
     whole, extra = (PreslidingHysteresis(2, 4e-4, f"dahl {extent}") for extent in ("whole", "extra"))
-    text, notes = _with(whole)
-    assert 'frictionloss="0.3"' in text.replace("0.30000000000000004", "0.3")
+    document, notes = written(whole)
+    assert 'frictionloss="0.3"' in document.text.replace("0.30000000000000004", "0.3")
     assert notes == ()
-    assert _with(extra) == (panda_mjcf(), ())
+    document, notes = written(extra)
+    assert (document.text, notes) == (panda_mjcf(), ())
 
 
-def test_what_the_file_cannot_hold_is_said_once():
-    _, notes = _with(*(PreslidingHysteresis(j, 0.01, "dahl whole") for j in (1, 2, 4)))
+def test_links_that_cannot_be_built_are_replaced_by_the_nearest_that_can(written):
+    """The file had the user's links instead: a payload's inertia about its long axis had come out negative."""
+    change = np.zeros((7, 10))
+    change[6] = [1.0, 0.03, 0.02, 0.1, 0.01, 0.0, 0.01, 0.0, 0.0, -0.001]
+    document, notes = written(change=change)
+    (note,) = (n for n in notes if "nearest that can" in n)
+    off = float(re.findall(r"torque is (\S+) N·m", note)[0])
+    assert off < 2 * NOISE
+    arm, _ = from_document(document)
+    assert float(arm.standard[6, 0]) == pytest.approx(float(Arm.panda().standard[6, 0]) + 1.0, rel=0.02)
+    np.testing.assert_allclose(arm.standard[:6], Arm.panda().standard[:6], rtol=1e-9, atol=1e-12)
+
+
+def test_what_the_file_cannot_hold_is_said_once(written):
+    _, notes = written(*(PreslidingHysteresis(j, 0.01, "dahl whole") for j in (1, 2, 4)))
     assert len(notes) == 1
 
 

@@ -24,9 +24,10 @@ from jaxpanda.feasible import (
     when,
 )
 from jaxpanda.feasible.convex import TOLERANCE, scaled_problem, solve_chunk, starting_points
+from jaxpanda.feasible.nearest import nearest_buildable
 from jaxpanda.feasible.outcome import XYZ_COLUMN, XYZ_ROW
 from jaxpanda.panda import panda, published
-from jaxpanda.parameters import coefficient_matrix
+from jaxpanda.parameters import coefficient_matrix, random_regressor
 
 
 def boxes(dof: int, total: tuple[float, float] | None = None) -> Bounds:
@@ -427,3 +428,42 @@ def test_links_much_larger_than_the_box_of_their_centre_of_mass_are_found(width,
     np.testing.assert_allclose(found.objective[:16], 1.0, rtol=1e-4)
     # Once, what damping and the start's pull held back was taken for the optimum.
     assert np.all(found.objective[found.converged] < 1 + TOLERANCE)
+
+
+def test_the_nearest_links_that_can_be_built_give_the_torque_of_those_that_cannot():
+    """What the torque does not show makes link 7 impossible, and is taken off; what it shows stays."""
+    arm = panda()
+    W = np.asarray(random_regressor(arm, 300)).reshape(-1, 70) / 0.05
+    _, root = np.linalg.qr(W)
+    begin = np.asarray(arm.standard)
+    payload = np.asarray(inertia.from_com(jnp.array(1.0), jnp.array([0.03, 0.02, 0.1]), 0.002 * jnp.eye(3)))
+    real = begin.copy()
+    real[6] += payload
+    _, values, directions = np.linalg.svd(W)
+    unfelt = directions[np.sum(values > 1e-8 * values[0]) :]
+    impossible = real + min(
+        ((sign * 0.05 * d / np.abs(d).max()).reshape(7, 10) for d in unfelt for sign in (-1, 1)),
+        key=lambda change: min(least_eigenvalue(link) for link in (real + change)),
+    )
+    assert min(least_eigenvalue(link) for link in impossible) < -1e-3
+    np.testing.assert_allclose(W @ (impossible - real).ravel(), 0.0, atol=1e-6)
+
+    found = nearest_buildable(impossible, np.zeros_like(real), begin, root, range(7))
+    assert min(least_eigenvalue(link) for link in found) > -1e-9
+    assert np.all(found[:, 0] > 0)
+    off, at_all = (np.sqrt(np.mean((W @ (one - real).ravel()) ** 2)) for one in (found, begin))
+    assert off < 0.1  # of the noise
+    assert off < 0.01 * at_all
+
+
+def test_of_links_that_carry_others_only_their_own_part_moves():
+    arm = panda()
+    _, root = np.linalg.qr(np.asarray(random_regressor(arm, 100)).reshape(-1, 70) / 0.05)
+    begin, carried = np.asarray(arm.standard), np.zeros((7, 10))
+    carried[6] = 0.5 * begin[6]
+    wanted = begin.copy()
+    wanted[6, 0] = 0.4 * begin[6, 0]  # less than it carries
+    found = nearest_buildable(wanted, carried, begin, root, [6])
+    np.testing.assert_array_equal(found[:6], wanted[:6])
+    assert found[6, 0] > carried[6, 0]
+    assert least_eigenvalue(found[6] - carried[6]) > -1e-9

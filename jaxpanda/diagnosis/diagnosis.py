@@ -16,7 +16,15 @@ from .. import signals as signals_
 from ..arm import Arm
 from ..corrected import FILE, XML, Corrected, read
 from ..errors import InputError, require_x64
-from ..export import edit_mjcf, missing_assets, panda_mjcf, write_document, write_parameters
+from ..export import (
+    ExportResult,
+    edit_mjcf,
+    missing_assets,
+    panda_mjcf,
+    write_document,
+    write_parameters,
+)
+from ..feasible.nearest import nearest_buildable
 from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, distinct, load
 from . import knowledge as knowledge_
@@ -229,7 +237,7 @@ def diagnose(
                    f" where it was not fitted: {', '.join(sorted(dropped))}"),
         )  # fmt: skip
     # numbers that only moved within what they were uncertain by stay as the user wrote them
-    written, warnings = _written(source, corrected if wrong else corrected.as_written)
+    written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
         verdict=_verdict(found, partly(state)),
@@ -387,7 +395,9 @@ def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) ->
     )
 
 
-def _written(source: MjcfSource, corrected: Corrected) -> tuple[markup.Document, tuple[str, ...]]:
+def _written(
+    source: MjcfSource, corrected: Corrected, problem: Problem
+) -> tuple[markup.Document, tuple[str, ...]]:
     """The user's file with what MuJoCo holds natively put in, and what could not be."""
     moved = bool(np.any(np.asarray(corrected.change)))
     if not (corrected.effects or moved):
@@ -400,11 +410,8 @@ def _written(source: MjcfSource, corrected: Corrected) -> tuple[markup.Document,
         getattr(native, n) if n == "springref" else jnp.maximum(getattr(native, n), 0.0) for n in names
     )
     arm = eqx.tree_at(lambda a: tuple(getattr(a, n) for n in names), corrected.arm, values)
-    try:
-        result = write_parameters(source, arm, np.asarray(native.standard) if moved else None)
-    except InputError as error:
-        warnings.append(f"corrected.xml: link inertias are left as they were: {error}")
-        result = write_parameters(source, arm, None)
+    result, told = _with_links(source, arm, np.asarray(native.standard) if moved else None, problem)
+    warnings += told
     document = result.document
     if not np.allclose(np.asarray(native.chain.gravity), np.asarray(corrected.arm.chain.gravity)):
         value = " ".join(repr(float(v)) for v in np.asarray(native.chain.gravity))
@@ -415,6 +422,36 @@ def _written(source: MjcfSource, corrected: Corrected) -> tuple[markup.Document,
     beyond = [f"corrected.xml cannot hold {e.name}: {e.equation}" for e, _ in corrected.beyond]
     warnings += dict.fromkeys(beyond)  # once, however many joints it is at
     return document, (*warnings, *result.warnings)
+
+
+def _with_links(
+    source: MjcfSource, arm: Arm, standard: Float[np.ndarray, "dof 10"] | None, problem: Problem
+) -> tuple[ExportResult, list[str]]:
+    """The user's file with these links, or the nearest that can be built, or its own; and which it is."""
+    try:
+        return write_parameters(source, arm, standard), []
+    except InputError as error:
+        if standard is None:
+            raise
+        refusal = error
+    weights = np.concatenate([t.weights for t in problem.traces]) / problem.noise(()).std
+    felt = np.concatenate([t.motion.regressor for t in problem.traces])
+    _, root = np.linalg.qr((weights[:, :, None] * felt).reshape(-1, standard.size))
+    carried = np.stack([link.lumped_standard for link in source.links])
+    changed = np.flatnonzero(np.any(standard != source.standard, axis=1))
+    nearest = nearest_buildable(standard, carried, source.standard, root, changed.tolist())
+    try:
+        result = write_parameters(source, arm, nearest)
+    except InputError:
+        return write_parameters(source, arm), [
+            f"corrected.xml: link inertias are left as they were: {refusal}"
+        ]
+    off = np.sqrt(np.mean((felt @ (nearest - standard).ravel()) ** 2, 0))
+    j = int(np.argmax(off))
+    return result, [
+        "corrected.xml: links as they were found could not be built; it has the nearest that can, whose torque"
+        f" is {off[j]:.3g} {arm.unit('N·m', j)} rms off at joint {j + 1} and less at the others"
+    ]
 
 
 def predict(folder: str | Path, motion: str | Path | Recording) -> Float[np.ndarray, "rows dof"]:
