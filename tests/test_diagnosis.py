@@ -19,7 +19,7 @@ from jaxpanda import Arm, InputError, Recording, markup
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
 from jaxpanda.diagnosis.decide import titles
-from jaxpanda.diagnosis.diagnosis import _written
+from jaxpanda.diagnosis.diagnosis import _buildable, _written
 from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check, inertial_spread
@@ -42,8 +42,10 @@ from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.drive import Backlash, JointElasticity
 from jaxpanda.effects.friction import CoulombFriction, FrictionDrift, StribeckFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
+from jaxpanda.effects.motion import masses
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.export import panda_mjcf
+from jaxpanda.feasible.nearest import are_buildable
 from jaxpanda.files import write_json
 from jaxpanda.mjcf import from_document
 from jaxpanda.report import to_html
@@ -253,19 +255,23 @@ def test_friction_over_a_hair_s_breadth_is_coulomb_s():
 
 
 @pytest.fixture(scope="module")
-def written():
-    """The Panda's file with a change of its links put in, and effects of 0.2 and 0.1; and what it cannot hold."""
+def own_panda():
+    """The Panda, its file, and a problem of its links."""
     arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", Path("panda.xml")))
-    problem = pose((prepare(record(0), arm),), (True,), "exact").problem
+    return arm, source, pose((prepare(record(0), arm),), (True,), "exact").problem
 
-    def of(*effects, change=0.0):
-        zeros, c = jnp.zeros(7), tuple(jnp.array([0.2, 0.1]) for _ in effects)
-        document, notes = _written(
-            source, Corrected(arm, jnp.zeros((7, 10)) + change, zeros, zeros, effects, c), problem
-        )
-        return document, notes
 
-    return of
+def changed(arm, change, *effects):
+    """The arm with its links changed and some effects of 0.2 and 0.1."""
+    zeros, c = jnp.zeros(7), tuple(jnp.array([0.2, 0.1]) for _ in effects)
+    return Corrected(arm, jnp.zeros((7, 10)) + change, zeros, zeros, effects, c)
+
+
+@pytest.fixture(scope="module")
+def written(own_panda):
+    """The Panda's file with that put in, and what it cannot hold."""
+    arm, source, problem = own_panda
+    return lambda *effects, change=0.0: _written(source, changed(arm, change, *effects), problem)
 
 
 def test_friction_that_sticks_is_mujoco_s_frictionloss(written):
@@ -289,6 +295,24 @@ def test_links_that_cannot_be_built_are_replaced_by_the_nearest_that_can(written
     arm, _ = from_document(document)
     assert float(arm.standard[6, 0]) == pytest.approx(float(Arm.panda().standard[6, 0]) + 1.0, rel=0.02)
     np.testing.assert_allclose(arm.standard[:6], Arm.panda().standard[:6], rtol=1e-9, atol=1e-12)
+
+
+def test_what_was_refitted_can_be_built_and_simulated(own_panda):
+    """Of links that no body has the replay ran away: what the torque does not show had made masses negative."""
+    arm, source, problem = own_panda
+    Y = problem.traces[0].motion.regressor.reshape(-1, 70)
+    _, values, directions = np.linalg.svd(Y, full_matrices=False)
+    unfelt = (directions[values < 1e-7 * values[0]].sum(0)).reshape(7, 10)
+    made_up = changed(arm, unfelt)
+    assert not are_buildable(np.asarray(made_up.native.standard))
+    real = _buildable(source, made_up, problem)
+    assert are_buildable(np.asarray(real.native.standard))
+    torque = lambda corrected: Y @ np.asarray(corrected.change).ravel()
+    assert np.sqrt(np.mean((torque(real) - torque(made_up)) ** 2)) < 0.1 * NOISE
+    assert np.linalg.eigvalsh(masses(real.native, problem.traces[0].motion.q[:50])).min() > 0
+
+    heavier = changed(arm, 0.5 * np.eye(7, 10) * np.eye(7)[6][:, None])
+    assert _buildable(source, heavier, problem) is heavier
 
 
 def test_what_the_file_cannot_hold_is_said_once(written):

@@ -12,6 +12,7 @@ import pytest
 from jaxpanda import load
 from jaxpanda.diagnosis import diagnose
 from jaxpanda.errors import InputError
+from jaxpanda.rollout import compare
 
 FOLDER = Path(__file__).parents[1] / "experiments" / "real_arms"
 
@@ -124,3 +125,5 @@ def test_the_real_panda_s_hysteresis_and_the_tilt_of_its_base_are_found(data, ex
     assert found.fit.held_out_rmse_after[6] < 0.15 * found.fit.held_out_rmse_before[6]
     ratio = found.fit.held_out_rmse_after / found.fit.held_out_rmse_before
     assert np.all(ratio < 0.7)
+    replay = compare(found.corrected, found.source, load(data / "gaz_panda"))
+    assert np.all(np.array(replay["rmse_rad_after"]) < 0.3 * np.array(replay["rmse_rad_before"]))

@@ -24,7 +24,7 @@ from ..export import (
     write_document,
     write_parameters,
 )
-from ..feasible.nearest import nearest_buildable
+from ..feasible.nearest import are_buildable, nearest_buildable
 from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, distinct, load
 from . import knowledge as knowledge_
@@ -42,6 +42,8 @@ from .uncertainty import polished
 from .unnamed import BEYOND
 
 NEXT_MOTION = "next_motion.csv"
+UNSEEN = 0.5
+"""Torque over the noise by which links may differ from those found, so that they can be built."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -229,6 +231,7 @@ def diagnose(
     wrong = numbers(problem, state, premises.changes) if contradicted and not found else []
     found = (*found, *wrong)
     corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
+    corrected = _buildable(source, corrected, problem)
     if any(lost):
         dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
         premises = dataclasses.replace(
@@ -395,6 +398,18 @@ def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) ->
     )
 
 
+def _buildable(source: MjcfSource, corrected: Corrected, problem: Problem) -> Corrected:
+    """The same torque from links that can be built, so that the arm can be simulated; where there are such."""
+    standard = np.asarray(corrected.native.standard)
+    carried = np.stack([link.lumped_standard for link in source.links])
+    if not np.any(np.asarray(corrected.change)) or are_buildable(standard - carried):
+        return corrected
+    nearest, off = _nearest(source, standard, problem)
+    if np.any(off > UNSEEN * problem.noise(()).std):
+        return corrected
+    return eqx.tree_at(lambda c: c.change, corrected, corrected.change + (nearest - standard))
+
+
 def _written(
     source: MjcfSource, corrected: Corrected, problem: Problem
 ) -> tuple[markup.Document, tuple[str, ...]]:
@@ -434,24 +449,31 @@ def _with_links(
         if standard is None:
             raise
         refusal = error
-    weights = np.concatenate([t.weights for t in problem.traces]) / problem.noise(()).std
-    felt = np.concatenate([t.motion.regressor for t in problem.traces])
-    _, root = np.linalg.qr((weights[:, :, None] * felt).reshape(-1, standard.size))
-    carried = np.stack([link.lumped_standard for link in source.links])
-    changed = np.flatnonzero(np.any(standard != source.standard, axis=1))
-    nearest = nearest_buildable(standard, carried, source.standard, root, changed.tolist())
+    nearest, off = _nearest(source, standard, problem)
     try:
         result = write_parameters(source, arm, nearest)
     except InputError:
         return write_parameters(source, arm), [
             f"corrected.xml: link inertias are left as they were: {refusal}"
         ]
-    off = np.sqrt(np.mean((felt @ (nearest - standard).ravel()) ** 2, 0))
     j = int(np.argmax(off))
     return result, [
         "corrected.xml: links as they were found could not be built; it has the nearest that can, whose torque"
         f" is {off[j]:.3g} {arm.unit('N·m', j)} rms off at joint {j + 1} and less at the others"
     ]
+
+
+def _nearest(
+    source: MjcfSource, standard: Float[np.ndarray, "dof 10"], problem: Problem
+) -> tuple[Float[np.ndarray, "dof 10"], Float[np.ndarray, " dof"]]:
+    """The nearest links that can be built, and how far their torque is off in the recordings, rms [N m]."""
+    weights = np.concatenate([t.weights for t in problem.traces]) / problem.noise(()).std
+    felt = np.concatenate([t.motion.regressor for t in problem.traces])
+    _, root = np.linalg.qr((weights[:, :, None] * felt).reshape(-1, standard.size))
+    carried = np.stack([link.lumped_standard for link in source.links])
+    changed = np.flatnonzero(np.any(standard != source.standard, axis=1))
+    nearest = nearest_buildable(standard, carried, source.standard, root, changed.tolist())
+    return nearest, np.sqrt(np.mean((felt @ (nearest - standard).ravel()) ** 2, 0))
 
 
 def predict(folder: str | Path, motion: str | Path | Recording) -> Float[np.ndarray, "rows dof"]:
