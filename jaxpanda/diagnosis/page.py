@@ -207,10 +207,11 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
             _draw_regime(left, xs, y, f)
             left.set(xlabel=label, ylabel=f"residual of {names[joint]} [{force}]")
             left.set_title("what is left without this finding, and its law")
-        time = trace.motion.time[rows[shown]]
-        _trail(right, time, lefts[shown], color="0.6", label="residual without this finding")
+        trail = np.full((2, trace.motion.samples), np.nan)  # no line across what does not count
+        trail[:, rows[shown]] = lefts[shown], fits[shown]
+        _trail(right, trace.motion.time, trail[0], color="0.6", label="residual without this finding")
         if one.terms:
-            _trail(right, time, fits[shown], color=_FIT, label="what it explains")
+            _trail(right, trace.motion.time, trail[1], color=_FIT, label="what it explains")
         for a, b in one.intervals or ():
             right.axvspan(a, b, color=_BEFORE, alpha=0.15, linewidth=0)
         right.set(xlabel=f"time in {_short(trace.name)} [s]", ylabel=f"[{force}]")
