@@ -16,6 +16,7 @@ from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.search import (
     ACCEPT,
     SHADOW,
+    divided,
     floors,
     grids,
     handicapped,
@@ -185,6 +186,29 @@ def test_one_cause_of_what_several_joints_show_comes_before_a_cause_for_each():
     assert chosen.effect.name == "gravity_direction"
     grown = with_terms(problem, [problem.term(chosen.effect, chosen.deviation)])
     assert helped_over(problem, grown, state) > 100.0 > 0.0 > helped_over(problem, state, grown)
+
+
+def test_two_joints_with_something_of_their_own_are_no_wrong_link_beyond_them():
+    springs = lambda t, q, qd, qdd: 20.0 * (q - 0.3) * np.eye(7)[1] + 15.0 * (q + 0.2) * np.eye(7)[2]
+
+    def heavier(t, q, qd, qdd):
+        more = np.zeros((7, 10))
+        more[2, :4] = 1.0, 0.05, -0.1, 0.1
+        return Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)).regressor @ more.ravel()
+
+    for extra, expected in (
+        (springs, {("joint_spring", (1,)), ("joint_spring", (2,))}),
+        (heavier, {("inertial_parameters", (2,))}),
+    ):
+        problem = posed(record(5, extra), record(6, extra))
+        state = start(problem)
+        library = [
+            g for g in problem.library if (g.name, g.effects[0].joints) == ("inertial_parameters", (2,))
+        ]
+        (link,) = grids(problem, state.design, state.noise, library)
+        wrong = with_terms(problem, [problem.term(link.effect, link.deviation)])
+        found = divided(problem, wrong, lambda _: None)
+        assert {t.key for t in found.terms} == expected
 
 
 def test_laws_of_single_joints_are_no_crowd_for_what_several_show_at_once():

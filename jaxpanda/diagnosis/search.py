@@ -115,7 +115,7 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
     search that begins with that is made as well, and taken if the recordings are likelier by it.
     """
     say = log.append if log is not None else (lambda _: None)
-    state = finish(problem, grow(problem, start(problem), say), say)
+    state = divided(problem, finish(problem, grow(problem, start(problem), say), say), say)
     for _ in range(ELECTIONS if len(state.terms) <= MOST_SWAPPED else 0):
         other = elected(problem, state, say)
         if other is state:
@@ -133,8 +133,25 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
     other = finish(problem, grow(problem, other, say, lasting=True), say)
     helped = helped_over(problem, other, state)
     gained = gained_over(problem, other, state)
-    say(f"which brings {gained:.0f} over the other, and {helped:.0f} where it was not fitted")
+    say(f"which brings {gained:.0f} over the other, and {helped:.0f} where not fitted")
     return other if helped > BEGUN else state
+
+
+def divided(problem: Problem, state: State, say: Any) -> State:
+    """With effects of single joints in the place of a wrong link, where the recordings are likelier by them.
+
+    A link weighs on every joint before it: it has most evidence where two of them have something of their own.
+    """
+    if not any(isinstance(t.effect, InertialParameters) for t in state.terms):
+        return state
+    say("another beginning: no link is wrong")
+    other = finish(problem, grow(problem, start(problem), say, links=False), say)
+    gained, more = gained_over(problem, other, state), len(other.terms) - len(state.terms)
+    helped = helped_over(problem, other, state)
+    say(
+        f"which brings {gained:.0f} over the other, with {more} terms more, and {helped:.0f} where not fitted"
+    )
+    return other if gained > SWAP + ACCEPT * max(more, 0) and helped > HELD_OUT else state
 
 
 def gained_over(problem: Problem, state: State, other: State) -> float:
@@ -192,8 +209,9 @@ def everywhere(problem: Problem, noise: Noise) -> list[Term]:
     return [term for chain in found for term in chain]
 
 
-def grow(problem: Problem, state: State, say: Any, *, lasting: bool = False) -> State:
-    """Add the likeliest effect while one has evidence; only what does not happen once, if `lasting`."""
+def grow(problem: Problem, state: State, say: Any, *, lasting: bool = False, links: bool = True) -> State:
+    """Add the likeliest effect while one has evidence; only what does not happen once, if `lasting`, and no wrong
+    link unless `links`."""
     proposals, joints = [], None
     most = max(MOST_TERMS, len(state.terms) + MOST_ADDED * (1 + lasting))
     most_names = MOST_NAMES + len({t.effect.name for t in state.terms})
@@ -203,6 +221,7 @@ def grow(problem: Problem, state: State, say: Any, *, lasting: bool = False) -> 
         held, names = {t.key for t in state.terms}, {t.effect.name for t in state.terms}
         new = [p for p in proposals if p.key not in held or p.effect.repeats]
         new = [p for p in new if p.key[0] in names or len(names) < most_names]
+        new = [p for p in new if links or not isinstance(p.effect, InertialParameters)]
         if lasting:
             new = [p for p in new if not p.effect.bound_to_recording]
             worthy = most_helpful(problem, state, new, say)
