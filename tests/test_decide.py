@@ -9,25 +9,16 @@ from helpers import record
 
 from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict
+from jaxpanda.diagnosis.credible import is_of_time
 from jaxpanda.diagnosis.decide import UNLIKELY, WANDERS, crowd, findings, unnamed_where_doubtful
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.next_motion import next_motion
 from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.search import (
-    ACCEPT,
-    SHADOW,
-    divided,
-    floors,
-    grids,
-    handicapped,
-    helped_over,
-    is_of_time,
-    most_helpful,
-    ranked,
-    refine,
-    start,
-    with_terms,
-)
+from jaxpanda.diagnosis.proposals import grids, handicapped, ranked
+from jaxpanda.diagnosis.rivals import ACCEPT
+from jaxpanda.diagnosis.search import divided, most_helpful
+from jaxpanda.diagnosis.shapes import refine
+from jaxpanda.diagnosis.state import SHADOW, floors, helped_over, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.drive import JointSpring

@@ -18,6 +18,7 @@ from helpers import NOISE, excitation, record
 from jaxpanda import Arm, InputError, Recording, markup
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
+from jaxpanda.diagnosis.credible import is_event
 from jaxpanda.diagnosis.decide import titles
 from jaxpanda.diagnosis.diagnosis import _buildable, _written
 from jaxpanda.diagnosis.events import Proposal
@@ -27,15 +28,8 @@ from jaxpanda.diagnosis.noise import autoregression, moments
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
 from jaxpanda.diagnosis.rivals import called, odds
-from jaxpanda.diagnosis.search import (
-    EVENT_SHADOW,
-    elected,
-    floors,
-    is_event,
-    is_undetermined,
-    transferable,
-    with_terms,
-)
+from jaxpanda.diagnosis.search import elected, is_undetermined, transferable
+from jaxpanda.diagnosis.state import EVENT_SHADOW, floors, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
@@ -387,7 +381,7 @@ def test_a_brief_contact_must_show_more_than_a_lasting_law_does_meanwhile(monkey
     friction = problem.term(CoulombFriction(3, 0.01), np.array([0.5]))
     state = with_terms(problem, [friction, contact])
     brief = floors(state, [1e6, 1e3])[1]
-    monkeypatch.setattr("jaxpanda.diagnosis.search.BRIEF", 0.1)
+    monkeypatch.setattr("jaxpanda.diagnosis.state.BRIEF", 0.1)
     assert brief == pytest.approx(floors(state, [1e6, 1e3])[1] / EVENT_SHADOW)
 
 

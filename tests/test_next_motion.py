@@ -15,7 +15,9 @@ from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.next_motion import motions, next_motion
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
-from jaxpanda.diagnosis.search import ACCEPT, grids, with_terms
+from jaxpanda.diagnosis.proposals import grids
+from jaxpanda.diagnosis.rivals import ACCEPT
+from jaxpanda.diagnosis.state import with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects.friction import ViscousFriction
 from jaxpanda.effects.sensing import TorqueOffset

@@ -13,7 +13,7 @@ from jaxpanda.diagnosis import search
 from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
-from jaxpanda.diagnosis.search import _score
+from jaxpanda.diagnosis.shapes import _score
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Channels, Stretches, joint_columns
 from jaxpanda.effects import effect as effect_

@@ -7,7 +7,8 @@ from helpers import excitation, half_correlated
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.search import first_steps, places, refine, score, start, with_terms
+from jaxpanda.diagnosis.shapes import first_steps, refine, score
+from jaxpanda.diagnosis.state import places, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.diagnosis.uncertainty import covariances, polished
 from jaxpanda.effects import AbstractEffect, Motion

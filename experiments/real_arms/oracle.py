@@ -9,7 +9,8 @@ from jaxpanda import signals
 from jaxpanda.diagnosis import Diagnosis
 from jaxpanda.diagnosis.diagnosis import fit
 from jaxpanda.diagnosis.problem import FOLDS, Problem, Term
-from jaxpanda.diagnosis.search import search, with_terms
+from jaxpanda.diagnosis.search import search
+from jaxpanda.diagnosis.state import with_terms
 from jaxpanda.effects import AbstractEffect
 
 _LOOSE = 30.0

@@ -22,7 +22,9 @@ from .events import Proposal, ripple
 from .evidence import Design, Noise
 from .library import Candidates
 from .problem import Problem
-from .search import ACCEPT, USUAL, State, grids
+from .proposals import USUAL, grids
+from .rivals import ACCEPT
+from .state import State
 
 _PAID = 7.0
 """What a search over shapes, sizes and places costs an effect, about [nats]."""

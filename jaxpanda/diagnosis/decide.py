@@ -17,7 +17,8 @@ from ..effects.sensing import TorqueGain
 from .finding import Finding, joined
 from .problem import Problem, Term
 from .rivals import called, odds
-from .search import State, instead, leftover, places, shares, without
+from .search import instead
+from .state import State, leftover, places, shares, without
 from .uncertainty import covariances
 from .unnamed import BEYOND, hum, standing_off, stuck
 

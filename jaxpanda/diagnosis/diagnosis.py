@@ -36,7 +36,8 @@ from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
-from .search import ELECTIONS, State, elected, transferable
+from .search import ELECTIONS, elected, transferable
+from .state import State
 from .traces import Trace, prepare
 from .uncertainty import polished
 from .unnamed import BEYOND

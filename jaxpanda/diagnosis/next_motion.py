@@ -30,7 +30,8 @@ from .host import parallel
 from .knowledge import Knowledge, nuisance
 from .library import columns_of
 from .problem import Problem, Term, posed
-from .search import State, grids
+from .proposals import grids
+from .state import State
 from .traces import TRIM, Trace, held_sign
 
 WORTH = 0.05

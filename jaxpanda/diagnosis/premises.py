@@ -25,7 +25,8 @@ from . import knowledge as knowledge_
 from .noise import Saturation
 from .problem import Problem, Term, posed
 from .rivals import ACCEPT
-from .search import State, gains, places, search
+from .search import search
+from .state import State, gains, places
 from .traces import Trace
 
 CONTRADICTION, SHARE = 100.0, 0.03

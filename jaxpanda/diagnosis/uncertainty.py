@@ -25,7 +25,8 @@ from ..identification import statistics
 from .evidence import Design
 from .noise import autoregression, moments
 from .problem import Problem, Term
-from .search import State, first_steps, moved, places, within
+from .shapes import first_steps, moved, within
+from .state import State, places
 
 _STEP_LOG, _STEP_SHARE, _STEP_TIME = 0.02, 0.002, 0.01
 """Steps of the differences: of a logarithm, as a share of the bounds, and of an instant [s]."""

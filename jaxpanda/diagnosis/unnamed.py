@@ -19,7 +19,7 @@ from scipy.signal.windows import hann
 from ..signals import Signals, white_noise
 from .finding import Finding, joined
 from .problem import Problem
-from .search import State
+from .state import State
 
 BEYOND = 4.0
 """Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""

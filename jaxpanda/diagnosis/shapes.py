@@ -1,0 +1,174 @@
+"""Shapes of one effect at one place: the evidence of each, and where it is highest."""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ..effects import AbstractEffect, AbstractJointEffect
+from ..effects.contact import ExternalContact
+from ..effects.load import EVER, PayloadChange
+from .events import BIN, Proposal
+from .evidence import Design, Noise, gram, log_bayes
+from .library import form_of
+from .problem import Problem
+from .scan import scales_of
+
+_ROUNDS = 4
+
+
+def clock(problem: Problem, recording: str) -> Float[np.ndarray, " time"]:
+    """Times of a recording, by its name [s]."""
+    return next(t.motion.time for t in problem.traces if t.name == recording)
+
+
+def first_steps(effect: AbstractEffect) -> tuple[float, ...]:
+    """Of a refinement: a factor where the shape is logarithmic, a tenth of a second for what happens in time."""
+    ranges = [s.upper - s.lower for s in effect.shapes]
+    return tuple(
+        0.3 if s.logarithmic else 0.03 * r if np.isfinite(r) else BIN
+        for s, r in zip(effect.shapes, ranges, strict=True)
+    )
+
+
+def _deviation(coefficients, columns: np.ndarray, unit: float) -> Float[np.ndarray, "m n"]:
+    """Prior deviation of each coefficient: its plausible size, or that of an effect as large as the noise.
+
+    Args:
+        coefficients: of the effect.
+        columns: `(time, m, n)`, or `(time, dof, m, n)` over the noise; the joint that feels most counts.
+        unit: noise of the joint.
+    """
+    size = np.sqrt((columns**2).mean(0))
+    if size.ndim == 3:
+        size = size.max(0)
+    deviation = unit / np.maximum(size, 1e-9 * max(float(size.max()), 1e-12))
+    for k, coefficient in enumerate(coefficients):
+        if coefficient.scale is not None:
+            deviation[:, k] = coefficient.scale
+    return deviation
+
+
+def score(
+    problem: Problem, design: Design, noise: Noise, effects: Sequence[AbstractEffect]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
+    """Evidence of single shapes of one form at one place, and their prior deviations."""
+    columns = problem.columns(effects)
+    value, scale, deviation = _score(problem, design, noise, effects, columns)
+    return value, deviation * scale[:, None]
+
+
+def _score(problem: Problem, design: Design, noise: Noise, effects, columns):
+    """Evidence, likeliest scale, and prior deviations before the scale."""
+    coefficients = effects[0].coefficients
+    signs = np.array([float(k.sign) for k in coefficients])
+    b, G = projection(problem, design, noise, effects, columns)
+    if isinstance(effects[0], AbstractJointEffect):
+        unit = float(noise.std[effects[0].joints[0]])
+        deviation = _deviation(coefficients, np.concatenate(columns), unit)
+    else:
+        deviation = _deviation(coefficients, np.concatenate(columns) / noise.std[:, None, None], 1.0)
+    value, scale = log_bayes(b, G, deviation, scales_of(effects[0]), signs)
+    return value, scale, deviation
+
+
+def projection(problem: Problem, design: Design, noise: Noise, effects, columns):
+    """b and G of single shapes of one form at one place."""
+
+    def prepared(j, parts):
+        Phi = problem.whitened(parts, noise, j)
+        return Phi, gram(Phi)
+
+    if isinstance(effects[0], AbstractJointEffect):
+        j = effects[0].joints[0]
+        return design.in_joint(j, *prepared(j, columns))
+    parts = [prepared(j, [c[:, j] for c in columns]) for j in range(problem.dof)]
+    return design.in_arm([p[0] for p in parts], [p[1] for p in parts])
+
+
+def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> Proposal:
+    """Move the shape to where the evidence is highest, and see if another form does better there.
+
+    A pattern search whose every round is one batch.
+    """
+    arm, shapes = problem.arm, proposal.effect.shapes
+    if not shapes and not proposal.effect.variants(arm):
+        return proposal
+    steps = proposal.steps[: len(shapes)]
+    effect, best, deviation = climbed(problem, design, noise, proposal.effect, steps)
+    variants = sorted(effect.variants(arm), key=form_of)
+    for _, alike in itertools.groupby(variants, form_of):
+        other = best_shape(problem, design, noise, list(alike))
+        if other[0].shapes and not effect.shapes:
+            other = climbed(problem, design, noise, other[0], first_steps(other[0]))
+        if other[1] > best:
+            effect, best, deviation = other
+    gained = best - proposal.best
+    return dataclasses.replace(
+        proposal, effect=effect, best=best, deviation=deviation, evidence=proposal.evidence + gained
+    )
+
+
+Shaped = tuple[AbstractEffect, float, Float[np.ndarray, " n"]]
+"""An effect, its evidence, and the prior deviations of its coefficients."""
+
+
+def climbed(
+    problem: Problem, design: Design, noise: Noise, effect: AbstractEffect, steps: Sequence[float]
+) -> Shaped:
+    """The shape near this one with the most evidence."""
+    best, deviation = evidence_of(problem, design, noise, effect)
+    if not steps:
+        return effect, best, deviation
+    scale = np.array(steps)
+    for _ in range(_ROUNDS if len(steps) == 1 else _ROUNDS + 3):
+        moves = [m * e for e in np.diag(scale) for m in (-1.0, 1.0, -0.4, 0.4)]
+        if len(steps) > 1:
+            moves += [np.array([a, b]) * scale[:2] for a in (-1, 1) for b in (-1, 1)]
+        tried = best_shape(problem, design, noise, [within(problem, moved(effect, move)) for move in moves])
+        if tried[1] > best:
+            gained = tried[1] - best
+            effect, best, deviation = tried
+            if gained < 0.05:
+                break
+        else:
+            scale = scale * 0.35
+    return effect, best, deviation
+
+
+def best_shape(problem: Problem, design: Design, noise: Noise, effects: Sequence[AbstractEffect]) -> Shaped:
+    """Of single shapes of one form at one place."""
+    values, deviations = score(problem, design, noise, effects)
+    top = int(values.argmax())
+    return effects[top], float(values[top]), deviations[top]
+
+
+def evidence_of(problem: Problem, design: Design, noise: Noise, effect: AbstractEffect):
+    return best_shape(problem, design, noise, [effect])[1:]
+
+
+def within(problem: Problem, effect: AbstractEffect) -> AbstractEffect:
+    """A change of payload kept inside its recording: beyond, it is a payload that was there throughout.
+
+    And a contact kept longer than what the filters of motion and torque resolve.
+    """
+    if isinstance(effect, ExternalContact) and effect.stop - effect.start < BIN:
+        middle = 0.5 * (float(effect.start) + float(effect.stop))
+        return dataclasses.replace(effect, start=middle - 0.5 * BIN, stop=middle + 0.5 * BIN)
+    if not isinstance(effect, PayloadChange):
+        return effect
+    time = clock(problem, effect.recording)
+    inside = lambda at: at if abs(at) >= EVER else float(np.clip(at, time[0] + 3 * BIN, time[-1] - 3 * BIN))
+    return dataclasses.replace(effect, start=inside(float(effect.start)), stop=inside(float(effect.stop)))
+
+
+def moved(effect: AbstractEffect, move: Float[np.ndarray, " shapes"]) -> AbstractEffect:
+    """The effect with its shape parameters moved, within their bounds."""
+    changes = {}
+    for shape, step in zip(effect.shapes, move, strict=False):
+        value = float(getattr(effect, shape.name))
+        value = value * np.exp(step) if shape.logarithmic else value + step
+        changes[shape.name] = float(np.clip(value, shape.lower, shape.upper))
+    return dataclasses.replace(effect, **changes)
