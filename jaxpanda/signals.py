@@ -241,10 +241,13 @@ def blocks(signals: Signals, folds: int = 5, guard: float = 0.1) -> list[Split]:
     return [splits[0] for splits in blocks_many([signals], folds, guard)]
 
 
-def blocks_many(signals: Sequence[Signals], folds: int = 5, guard: float = 0.1) -> list[list[Split]]:
+def blocks_many(
+    signals: Sequence[Signals], folds: int = 5, guard: float = 0.1, rounds: int = 1
+) -> list[list[Split]]:
     """`blocks` for several recordings: for each fold, one split a recording.
 
-    Recordings that share motion share their blocks.
+    Recordings that share motion share their blocks. A fold holds out one block of each of `rounds` parts of a
+    recording: several leave something of every time in training.
     """
     clocks = _clocks(signals)
     result: list[list[Split]] = []
@@ -253,11 +256,14 @@ def blocks_many(signals: Sequence[Signals], folds: int = 5, guard: float = 0.1) 
         for s, (offset, start, length, cyclic) in zip(signals, clocks, strict=True):
             phase = s.times - offset - start
             phase = np.mod(phase, length) if cyclic else phase
-            low, high = k * length / folds, (k + 1) * length / folds
-            test = (phase >= low) & (phase < high) if k < folds - 1 else phase >= low
-            near = (phase >= low - guard) & (phase < high + guard)
-            if cyclic:
-                near |= (phase >= low - guard + length) | (phase < high + guard - length)
+            test, near = np.zeros(len(phase), bool), np.zeros(len(phase), bool)
+            size = length / (folds * rounds)
+            for block in range(k, folds * rounds, folds):
+                low, high = block * size, (block + 1) * size
+                test |= (phase >= low) & ((phase < high) | (block == folds * rounds - 1))
+                near |= (phase >= low - guard) & (phase < high + guard)
+                if cyclic:
+                    near |= (phase >= low - guard + length) | (phase < high + guard - length)
             splits.append((~test & ~near, test))
         result.append(splits)
     for k, splits in enumerate(result):

@@ -27,8 +27,8 @@ _MEMORY = 1 << 28
 """Bytes of columns of shapes off the grid that are kept."""
 _UNHEARD = 1e9
 """Innovations of a joint that no recording tells anything about [N m]."""
-FOLDS = 5
-"""Blocks of the cross-validation."""
+FOLDS, ROUNDS = 5, 5
+"""Blocks of the cross-validation, and how often they come in a recording for what changes with time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,21 +280,32 @@ class Problem:
     @functools.cached_property
     def folds(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Rows to train and to test on, blocked so that no test repeats training data."""
-        splits = signals_.blocks_many([t.signals for t in self.traces], FOLDS)
+        return self._folds()
+
+    @functools.cached_property
+    def spread_folds(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The same in shorter blocks, each fold's all over the recording: of what changes with time, a long block
+        left out is the only one that shows how it was then."""
+        return self._folds(ROUNDS)
+
+    def _folds(self, rounds: int = 1) -> list[tuple[np.ndarray, np.ndarray]]:
+        splits = signals_.blocks_many([t.signals for t in self.traces], FOLDS, rounds=rounds)
         return [
             (np.concatenate([s[0] for s in fold]), np.concatenate([s[1] for s in fold])) for fold in splits
         ]
 
-    def held_out_error(self, design: Design, counts: Bool[np.ndarray, " rows"] | None = None) -> float:
+    def held_out_error(
+        self, design: Design, counts: Bool[np.ndarray, " rows"] | None = None, *, spread: bool = False
+    ) -> float:
         """Squared whitened error on blocks that the coefficients were not fitted to, in the rows that count."""
-        error = 0.0
-        for (_, test), x in zip(self.folds, _left_out(design, self.folds), strict=True):
+        error, folds = 0.0, self.spread_folds if spread else self.folds
+        for (_, test), x in zip(folds, _left_out(design, folds), strict=True):
             rows = test if counts is None else test & counts
             for A, r in zip(design.columns, design.residual, strict=True):
                 error += float(np.sum((r[rows] - A[rows] @ x) ** 2))
         return error
 
-    def predicted_error(self, design: Design, noise: Noise) -> tuple[float, float]:
+    def predicted_error(self, design: Design, noise: Noise, *, spread: bool = False) -> tuple[float, float]:
         """Squared error of predicted torque, over the noise's deviation, where coefficients were not fitted: with
         the model of the design, and with the user's.
 
@@ -304,7 +315,8 @@ class Problem:
         """
         of = np.repeat(np.arange(len(self.traces)), [t.motion.samples for t in self.traces])
         folds = [(of != r, of == r) for r, on in enumerate(self.active) if on]
-        folds = folds if len(folds) > 1 else self.folds
+        if len(folds) == 1:
+            folds = self.spread_folds if spread else self.folds
         weight = np.concatenate([t.weights for t in self.traces]) / noise.std
         residual = np.concatenate(self.residual)
         parts = zip(self.nuisance, *(t.columns for t in design.terms), strict=True)

@@ -249,11 +249,12 @@ def gate(problem: Problem, state: State, say: Any) -> State:
         once = [t.effect.bound_to_recording for t in state.terms]
         energy = energies(state)[once].sum((0, 1)) if any(once) else np.zeros(len(state.design.residual[0]))
         counts = energy <= 0
-        reference = problem.held_out_error(state.design, counts)
+        reference = {x: problem.held_out_error(state.design, counts, spread=x) for x in (False, True)}
         for i in np.argsort(gains(state)):
             if once[i]:
                 continue
-            helped = problem.held_out_error(without(state, int(i)), counts) - reference
+            drifts = state.terms[i].effect.drifts
+            helped = problem.held_out_error(without(state, int(i)), counts, spread=drifts) - reference[drifts]
             if helped < HELD_OUT:
                 say(f"gate {state.terms[i].key}: held-out error falls by {helped:.1f} only")
                 state = with_terms(problem, (*state.terms[:i], *state.terms[i + 1 :]))
@@ -272,7 +273,12 @@ def transferable(problem: Problem, state: State) -> State:
     state = with_terms(problem, [t for i, t in enumerate(state.terms) if not is_undetermined(state, i)])
     while lasting := [i for i, t in enumerate(state.terms) if not t.effect.bound_to_recording]:
         whole, users = problem.predicted_error(state.design, state.noise)
-        harm = {i: whole - problem.predicted_error(without(state, i), state.noise)[0] for i in lasting}
+        all_over, _ = problem.predicted_error(state.design, state.noise, spread=True)
+        harm = {}
+        for i in lasting:
+            drifts = state.terms[i].effect.drifts
+            less, _ = problem.predicted_error(without(state, i), state.noise, spread=drifts)
+            harm[i] = (all_over if drifts else whole) - less
         worst = max(harm, key=lambda i: harm[i])
         if harm[worst] > 0:
             state = with_terms(problem, (*state.terms[:worst], *state.terms[worst + 1 :]))
