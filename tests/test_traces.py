@@ -91,9 +91,21 @@ def test_friction_that_gear_teeth_carry_is_load_dependent_and_directed():
 
 
 @pytest.mark.parametrize(
-    "drift", [FrictionDrift(0, 5.0, 0.01, "both", until=10.0), TorqueDrift(0, 5.0, "offset", until=10.0)]
+    "drift", [FrictionDrift(0, 50.0, 0.01, "both", until=10.0), TorqueDrift(0, 50.0, "offset", until=10.0)]
 )
-def test_a_drift_holds_where_the_recording_ended(drift):
+def test_a_drift_holds_where_the_recording_ended_before_it_settled(drift):
     at = lambda t: drift.at(Channels(jnp.asarray(t), *(jnp.ones(2),) * 5))
     np.testing.assert_array_equal(at(10.0), at(30.0))
     assert np.abs(at(9.0) - at(10.0)).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    "drift", [FrictionDrift(0, 5.0, 0.01, "both", until=10.0), TorqueDrift(0, 5.0, "offset", until=10.0)]
+)
+def test_a_drift_seen_for_its_time_constant_goes_on_to_where_it_settles(drift):
+    """Held at what it had come to, the rest of a warm-up was missing from every later motion."""
+    at = lambda t: drift.at(Channels(jnp.asarray(t), *(jnp.ones(2),) * 5))
+    free = dataclasses.replace(drift, until=1e9)
+    for t in (3.0, 10.0, 30.0):
+        np.testing.assert_allclose(at(t), free.at(Channels(jnp.asarray(t), *(jnp.ones(2),) * 5)), rtol=1e-12)
+    np.testing.assert_allclose(at(30.0)[0], -np.expm1(-6.0), rtol=1e-6)

@@ -380,6 +380,15 @@ def _advance(effects, z, first, channels, dt):
     return jax.vmap(lambda effect, z: effect.advance(z, channels, dt), out_axes=(0, 1))(effects, z)
 
 
+def settling(t: Array | np.ndarray, time_constant: Array | float, until: Array | float) -> Array:
+    r"""$1 - e^{-t/T}$ of what was recorded up to `until` [s].
+
+    Where less than T was, that is a trend whose end nobody has seen: what it came to is held.
+    """
+    seen = jnp.where(time_constant > until, jnp.minimum(t, until), t)
+    return -jnp.expm1(-seen / time_constant)
+
+
 def smooth_sign(qd: Array, width: Array | float) -> Array:
     r"""$\tanh(\dot q / v_0)$: the sign of a velocity, for simulators and for velocities that carry noise."""
     return jnp.tanh(qd / width)

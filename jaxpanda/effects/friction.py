@@ -9,7 +9,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractDryFriction, AbstractInstantEffect, Coefficient, Numbers, Shape, smooth_sign
+from .effect import (
+    AbstractDryFriction,
+    AbstractInstantEffect,
+    Coefficient,
+    Numbers,
+    Shape,
+    settling,
+    smooth_sign,
+)
 from .motion import Channels, Joint
 
 _WIDTH = Shape("v0", "rad/s", 1e-3, 0.3)
@@ -311,9 +319,8 @@ class FrictionDrift(AbstractDryFriction):
     $$\tau_j = g(t)\,(a \tanh(\dot q_j / v_0) + b\,\dot q_j) + F_c \tanh(\dot q_j / v_0) + F_v \dot q_j, \qquad
       g(t) = 1 - e^{-t/T}$$
 
-    A long time constant is a linear trend; what it came to is held after `until` [s], the end of what was
-    recorded. Form "level" has `a` and `F_c` only, "slope" `b` and `F_v`, "both" all; "... extra" leaves out the
-    constant part.
+    After `until` [s], the end of what was recorded, it goes on as `settling` says. Form "level" has `a` and `F_c`
+    only, "slope" `b` and `F_v`, "both" all; "... extra" leaves out the constant part.
 
     References:
         Simoni et al., Robotica 2017; Wolf and Iskandar, ICRA 2018.
@@ -386,7 +393,7 @@ class FrictionDrift(AbstractDryFriction):
         )
 
     def _share(self, s: Channels) -> Float[Array, ""]:
-        return -jnp.expm1(-jnp.minimum(s.t, self.until) / self.time_constant)
+        return settling(s.t, self.time_constant, self.until)
 
     def levels(self, s: Channels) -> Float[Array, " n"]:
         g = self._share(s)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape
+from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape, settling
 from .motion import Channels, Joint, Motion
 from .twist import low_passed
 
@@ -91,10 +91,10 @@ class TorqueGain(AbstractInstantEffect):
 class TorqueDrift(AbstractInstantEffect):
     r"""Bias of a torque sensor that changes over time, $\tau_j = a\,g(t) + b$ with $g = 1 - e^{-t/T}$.
 
-    A long time constant is a linear trend; what it came to is held after `until` [s], the end of what was
-    recorded. Form "extra" is without the constant; "wave" is
-    $a\,t + b + s \sin(2\pi t/T) + c \cos(2\pi t/T)$, a bias that wanders; "wandering" adds half the period to it.
-    What wanders goes on to nobody knows where: after `until` it returns to its mean within $T/2\pi$.
+    After `until` [s], the end of what was recorded, it goes on as `settling` says. Form "extra" is without the
+    constant; "wave" is $a\,t + b + s \sin(2\pi t/T) + c \cos(2\pi t/T)$, a bias that wanders; "wandering" adds
+    half the period to it. What wanders goes on to nobody knows where: after `until` it returns to its mean within
+    $T/2\pi$.
     """
 
     name: ClassVar[str] = "torque_drift"
@@ -143,7 +143,7 @@ class TorqueDrift(AbstractInstantEffect):
 
     def at(self, s: Channels) -> Float[Array, " n"]:
         t = jnp.minimum(s.t, self.until)
-        one, phase = jnp.ones_like(t), t / self.time_constant
+        one = jnp.ones_like(t)
         if self.form in ("wave", "wandering"):
             w = 2 * jnp.pi / self.time_constant
             waves = (w,) if self.form == "wave" else (w, 2 * w)
@@ -152,7 +152,7 @@ class TorqueDrift(AbstractInstantEffect):
             means = [m for x in ends for m in ((1 - jnp.cos(x)) / x, jnp.sin(x) / x)]
             mean = jnp.stack([0.5 * self.until * one, one, *means])
             return mean + (jnp.stack(now) - mean) * jnp.exp(-w * jnp.maximum(s.t - self.until, 0.0))
-        g = -jnp.expm1(-phase)
+        g = settling(s.t, self.time_constant, self.until)
         return jnp.stack([g] if self.form == "extra" else [g, one])
 
     def sensed(self, c, t, tau):
