@@ -247,7 +247,8 @@ def blocks_many(
     """`blocks` for several recordings: for each fold, one split a recording.
 
     Recordings that share motion share their blocks. A fold holds out one block of each of `rounds` parts of a
-    recording: several leave something of every time in training.
+    recording: several leave something of every time in training. There are fewer where blocks would be shorter
+    than thrice the guard.
     """
     clocks = _clocks(signals)
     result: list[list[Split]] = []
@@ -257,10 +258,10 @@ def blocks_many(
             phase = s.times - offset - start
             phase = np.mod(phase, length) if cyclic else phase
             test, near = np.zeros(len(phase), bool), np.zeros(len(phase), bool)
-            size = length / (folds * rounds)
-            for block in range(k, folds * rounds, folds):
-                low, high = block * size, (block + 1) * size
-                test |= (phase >= low) & ((phase < high) | (block == folds * rounds - 1))
+            count = folds * max(1, min(rounds, int(length / (3 * guard * folds)) if guard else rounds))
+            for block in range(k, count, folds):
+                low, high = block * length / count, (block + 1) * length / count
+                test |= (phase >= low) & ((phase < high) | (block == count - 1))
                 near |= (phase >= low - guard) & (phase < high + guard)
                 if cyclic:
                     near |= (phase >= low - guard + length) | (phase < high + guard - length)

@@ -234,6 +234,18 @@ def test_blocks_of_a_motion_that_does_not_repeat_are_contiguous():
     assert np.all(tested == 1)
 
 
+@pytest.mark.parametrize(("seconds", "rounds"), [(20.0, 5), (3.0, 1)])
+def test_blocks_in_rounds_leave_something_of_every_time_in_training(seconds, rounds):
+    """In a recording too short for that a fold is one block, as without."""
+    made = prepare(recording(seconds))
+    tested = np.zeros(len(made.keep), int)
+    for ((train, test),) in blocks_many([made], folds=5, guard=0.1, rounds=5):
+        tested += test
+        assert 1 + np.count_nonzero(np.diff(np.flatnonzero(test)) > 1) == rounds
+        assert np.min(np.abs(made.times[train][:, None] - made.times[test][None, :])) > 0.09
+    assert np.all(tested == 1)
+
+
 def test_more_folds_than_samples_are_refused():
     with pytest.raises(InputError, match="use fewer folds"):
         blocks(prepare(recording(2.0)), folds=500)
