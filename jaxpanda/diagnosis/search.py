@@ -249,7 +249,8 @@ def gate(problem: Problem, state: State, say: Any) -> State:
         once = [t.effect.bound_to_recording for t in state.terms]
         energy = energies(state)[once].sum((0, 1)) if any(once) else np.zeros(len(state.design.residual[0]))
         counts = energy <= 0
-        reference = {x: problem.held_out_error(state.design, counts, spread=x) for x in (False, True)}
+        kinds = {t.effect.drifts for t in state.terms}
+        reference = {x: problem.held_out_error(state.design, counts, spread=x) for x in kinds}
         for i in np.argsort(gains(state)):
             if once[i]:
                 continue
@@ -273,7 +274,8 @@ def transferable(problem: Problem, state: State) -> State:
     state = with_terms(problem, [t for i, t in enumerate(state.terms) if not is_undetermined(state, i)])
     while lasting := [i for i, t in enumerate(state.terms) if not t.effect.bound_to_recording]:
         whole, users = problem.predicted_error(state.design, state.noise)
-        all_over, _ = problem.predicted_error(state.design, state.noise, spread=True)
+        drifting = any(state.terms[i].effect.drifts for i in lasting)
+        all_over = problem.predicted_error(state.design, state.noise, spread=True)[0] if drifting else whole
         harm = {}
         for i in lasting:
             drifts = state.terms[i].effect.drifts

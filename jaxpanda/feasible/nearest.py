@@ -59,11 +59,13 @@ def nearest_buildable(
         U[:, *_UPPER] = x.reshape(len(moving), -1)
         return U
 
-    def residual(x: np.ndarray) -> np.ndarray:
+    def bodies(x: np.ndarray) -> np.ndarray:
         U = factors(x)
-        phi = (U @ np.swapaxes(U, 1, 2)).reshape(len(moving), 16) @ linear.T
+        return (U @ np.swapaxes(U, 1, 2)).reshape(len(moving), 16) @ linear.T
+
+    def residual(x: np.ndarray) -> np.ndarray:
         away = (x.reshape(triangles.shape) - triangles) / size
-        return np.concatenate([np.einsum("rlp,lp->r", felt, phi) - target, away.ravel()])
+        return np.concatenate([np.einsum("rlp,lp->r", felt, bodies(x)) - target, away.ravel()])
 
     def jacobian(x: np.ndarray) -> np.ndarray:
         steps = np.zeros((len(_UPPER[0]), 4, 4))
@@ -81,9 +83,8 @@ def nearest_buildable(
         x_scale="jac",
         max_nfev=_STEPS,
     )
-    U = factors(solved.x)
     out = np.array(found, float)
-    out[moving] = (U @ np.swapaxes(U, 1, 2)).reshape(len(moving), 16) @ linear.T + carried[moving]
+    out[moving] = bodies(solved.x) + carried[moving]
     return out
 
 
