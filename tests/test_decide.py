@@ -11,18 +11,19 @@ from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.credible import is_of_time
 from jaxpanda.diagnosis.decide import UNLIKELY, WANDERS, crowd, findings, unnamed_where_doubtful
+from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.next_motion import next_motion
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.proposals import grids, handicapped, ranked
 from jaxpanda.diagnosis.rivals import ACCEPT
 from jaxpanda.diagnosis.search import divided, most_helpful
-from jaxpanda.diagnosis.shapes import refine
-from jaxpanda.diagnosis.state import SHADOW, floors, helped_over, start, with_terms
+from jaxpanda.diagnosis.shapes import first_steps, refine
+from jaxpanda.diagnosis.state import SHADOW, floors, gains, helped_over, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
-from jaxpanda.effects.drive import JointSpring
-from jaxpanda.effects.friction import CoulombFriction
+from jaxpanda.effects.drive import JointSpring, TorqueRipple
+from jaxpanda.effects.friction import CoulombFriction, FrictionDrift
 from jaxpanda.effects.sensing import TorqueDrift, TorqueOffset
 from jaxpanda.effects.unknown import Unknown
 
@@ -126,6 +127,62 @@ def test_a_curve_of_another_joint_s_motion_stands_in_that_joint_s_shadow():
         SHADOW * 1e5, rel=1e-6
     )
     assert floors(with_terms(problem, [friction, own]), gained)[1] == pytest.approx(ACCEPT)
+
+
+def test_a_law_that_takes_away_nearly_all_that_is_left_stands_in_no_shadow():
+    """Beside presliding hysteresis of 190,000 nats load-dependent friction of 3,600 was refused as a leftover."""
+    both = lambda t, q, qd, qdd: np.eye(7)[3] * (10.0 * np.tanh(qd[:, [3]] / 0.01) + q[:, [3]] + 1.57)
+    problem = posed(record(3, both), record(4, both))
+    friction = problem.term(CoulombFriction(3, 0.01), np.array([10.0]))
+    spring = problem.term(JointSpring(3, "linear"), np.ones(2))
+    ripple = problem.term(TorqueRipple(3, 40.0, "one"), np.ones(2))
+    least = {}
+    for term in (spring, ripple):
+        state = with_terms(problem, [friction, term])
+        gained = gains(state)
+        assert ACCEPT < gained[1] < SHADOW * gained[0]
+        least[term.effect.name] = floors(state, gained)[1]
+    assert least["joint_spring"] == pytest.approx(ACCEPT)
+    assert least["torque_ripple"] == pytest.approx(SHADOW * gained[0], rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [1.0, 0.08])
+def test_friction_and_damping_together_are_no_stribeck_friction(size):
+    """Laws that hold both had more evidence than either alone, and one of them was named at 0.9."""
+    rubs = lambda t, q, qd, qdd: size * np.eye(7)[3] * (np.tanh(qd[:, [3]] / 0.004) + 1.5 * qd[:, [3]])
+    found = diagnose(None, [record(20, rubs), record(21, rubs)], knowledge="exact").findings
+    assert {(f.effect, f.joints) for f in found} == {("coulomb_friction", (3,)), ("viscous_friction", (3,))}
+    number = {p["name"]: p["value"] for f in found for p in f.parameters}
+    assert number["coulomb"] == pytest.approx(size, rel=0.05)
+    assert number["damping"] == pytest.approx(1.5 * size, rel=0.1)
+
+
+@pytest.mark.slow
+def test_damping_that_differs_between_the_directions_with_the_level_is_one_finding():
+    """Its damping, common to both directions, was left out, and a third of the torque at speed with it."""
+
+    def rubs(t, q, qd, qdd):
+        v = qd[:, [3]]
+        return np.eye(7)[3] * (1 + 0.4 * np.sign(v)) * (np.tanh(v / 0.004) + 0.6 * v)
+
+    (found,) = diagnose(None, [record(20, rubs), record(21, rubs)], knowledge="exact").findings
+    assert (found.effect, found.joints) == ("asymmetric_friction", (3,))
+    number = {p["name"]: p["value"] for p in found.parameters}
+    expected = {"coulomb": 1.0, "coulomb_asymmetry": 0.4, "damping": 0.6, "damping_asymmetry": 0.24}
+    assert {n: number[n] for n in expected} == pytest.approx(expected, rel=0.1)
+
+
+def test_a_shape_far_from_the_grid_is_reached():
+    """Friction that turns over 0.25 rad/s, far from the grid's 0.03, was called another law."""
+    wide = lambda t, q, qd, qdd: np.eye(7)[3] * (5.0 * np.exp(-t / 6.0))[:, None] * np.tanh(qd[:, [3]] / 0.25)
+    problem = posed(record(20, wide, seconds=16.0))
+    state, begin = start(problem), FrictionDrift(3, 20.0, 0.02, "level")
+    first = Proposal(begin, 0.0, 0.0, np.ones(2), first_steps(begin))
+    drift = refine(problem, state.design, state.noise, first)
+    assert isinstance(drift.effect, FrictionDrift)
+    assert float(drift.effect.v0) == pytest.approx(0.25, rel=0.1)
+    assert float(drift.effect.time_constant) == pytest.approx(6.0, rel=0.2)
 
 
 @pytest.mark.parametrize(

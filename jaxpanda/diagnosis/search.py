@@ -10,13 +10,14 @@ from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import TorqueRipple
 from ..effects.effect import AbstractDryFriction
+from ..effects.friction import CoulombFriction, ViscousFriction
 from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
 from .credible import has_play, is_dissipative, is_event, is_of_time
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem, Term
-from .proposals import CLOSE, free_forms, grids, ranked, slow_ripple
-from .rivals import ACCEPT, called, odds
+from .proposals import CLOSE, RICHER_SHARE, free_forms, grids, ranked, slow_ripple
+from .rivals import ACCEPT, HOLDS, SPECIAL, TEMPERATURE, called, odds
 from .shapes import evidence_of, first_steps, refine
 from .state import (
     SHADOW,
@@ -73,7 +74,10 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
         say(f"which brings {gained:.0f}, with {more} terms more")
         if more > 0 and gained < ACCEPT * more:
             break
+        alike = sorted(t.key for t in other.terms) == sorted(t.key for t in state.terms)
         state = other
+        if alike:  # what was elected was replaced again
+            break
     if len(state.terms) < CROWDED:
         return state
     say("another beginning: friction and offset at all joints")
@@ -125,7 +129,7 @@ def elected(problem: Problem, state: State, say: Any) -> State:
 def finish(problem: Problem, state: State, say: Any) -> State:
     """Drop, exchange and test terms until the rest stands."""
     state = swap(problem, handed_over(problem, prune(problem, state, say), say), say)
-    state = handed_over(problem, prune(problem, state, say), say)
+    state = taken_apart(problem, handed_over(problem, prune(problem, state, say), say), say)
     return gate(problem, contest(problem, state, say), say)
 
 
@@ -197,7 +201,13 @@ def is_worthy(problem: Problem, state: State, proposal: Proposal, say: Any) -> b
     least = floors(grown, [*gains(state), evidence])[-1]
     if evidence < least:
         say(f"{describe([proposal])} brings {evidence:.0f}, less than {least:.0f}: a shadow")
-    return bool(evidence >= least)
+        return False
+    if proposal.effect.name != "unknown":
+        return True
+    helped = problem.held_out_error(state.design) - problem.held_out_error(grown.design)
+    if helped < HELD_OUT:
+        say(f"{describe([proposal])}: held-out error falls by {helped:.1f} only")
+    return helped >= HELD_OUT
 
 
 def most_helpful(problem: Problem, state: State, proposals: Sequence[Proposal], say: Any) -> Proposal | None:
@@ -376,6 +386,33 @@ def handed_over(problem: Problem, state: State, say: Any) -> State:
             break
         else:
             return state
+
+
+def taken_apart(problem: Problem, state: State, say: Any) -> State:
+    """Coulomb's and viscous friction in the place of a law that holds both, where they do about as well.
+
+    No rival of that law shows that it is not needed: each of them alone lacks the other.
+    """
+    simple = (CoulombFriction.name, ViscousFriction.name)
+    for i, term in enumerate(state.terms):
+        if not set(simple) <= set(HOLDS.get(term.effect.name, ())):
+            continue
+        others, parts = (*state.terms[:i], *state.terms[i + 1 :]), dict[str, Term]()
+        groups = [g for g in problem.library if (g.joint,) == term.effect.joints]
+        new = [name for name in simple if all(t.key != (name, term.effect.joints) for t in others)]
+        for name in (*new, *new[:1]):  # the first once more, beside the second
+            beside = problem.design((*others, *(p for n, p in parts.items() if n != name)), state.noise)
+            (best,) = grids(problem, beside, state.noise, [g for g in groups if g.name == name])
+            best = refine(problem, beside, state.noise, best)
+            parts[name] = problem.term(best.effect, best.deviation)
+        apart = problem.design((*others, *parts.values()), state.noise)
+        gained = apart.log_evidence - state.design.log_evidence
+        whole = state.design.log_evidence - without(state, i).log_evidence
+        if gained > -max(SPECIAL * TEMPERATURE, RICHER_SHARE * whole):
+            say(f"{term.key} taken apart into Coulomb's and viscous friction: {gained:.1f}")
+            state = prune(problem, with_terms(problem, (*others, *parts.values())), say)
+            return taken_apart(problem, state, say)
+    return state
 
 
 def held_evidence(problem: Problem, state: State, i: int) -> float:

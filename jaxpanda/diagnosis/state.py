@@ -7,17 +7,22 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import Backlash, JointElasticity
+from ..effects.friction import CoulombFriction, ViscousFriction
 from ..effects.unknown import Unknown, UnknownOfTwo
 from .evidence import Design, Noise
 from .problem import Problem, Term
-from .rivals import ACCEPT
+from .rivals import ACCEPT, called
 
 SHADOW, EVENT_SHADOW = 0.03, 0.5
 """Share of a stronger term's evidence, in the joints and at the times where a weaker one acts, below which
 the weaker is taken for its shadow: for what the stronger's shape, never quite right, leaves over. Events in
 time, which fit any such leftover somewhere, need a larger share."""
+UNEXPLAINED, CLEARED = 1.0, 0.15
+"""Mean square beyond the noise's, over it, of what the others leave in a joint, and the share of that which is
+left at most by a law that is no shadow: what a shape that is not quite right leaves has the shape of no law."""
 BRIEF = 0.3
 """Duration below which a contact may be what a law leaves of a reversal or an impact [s]."""
 SECOND_JOINT = 0.03
@@ -117,7 +122,9 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
     share $s_{kj}$ of the stronger one's that acts in joint j while the term does. What is strong in one joint
     casts no shadow on another. A soft joint's swings and a gap's impacts come at moments that the fitted law has
     elsewhere: their shadow falls on all times. A contact as brief as the reversal of a joint could be all that a
-    stronger law has wrong there. A free form of another joint's motion stands in that joint's shadow too.
+    stronger law has wrong there. A free form of another joint's motion stands in that joint's shadow too. A law
+    that takes away nearly all that the others leave in its joint stands in none, nor do Coulomb's and viscous
+    friction, which every gear has, in that of each other.
     """
     energy = energies(state)
     total = np.maximum(energy.sum((1, 2)), 1e-300)
@@ -132,8 +139,8 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
         brief = isinstance(term.effect, ExternalContact) and term.effect.stop - term.effect.start < BRIEF
         beside = 0.0
         for k in range(len(total)):
-            if gained[k] > gained[i]:
-                other = state.terms[k].effect
+            other = state.terms[k].effect
+            if gained[k] > gained[i] and not are_plain(term.effect, other):
                 swings = isinstance(other, Backlash | JointElasticity)
                 felt = energy[k].sum(1) if swings else energy[k][:, rows].sum(1)
                 whole = brief and not other.bound_to_recording
@@ -143,5 +150,25 @@ def floors(state: State, gained: Sequence[float]) -> list[float]:
             beyond = total[i] * (1 - where.max())
             if beyond < max(SECOND_JOINT * total[i], 0.5 * ACCEPT):
                 least = np.inf
+        elif gained[i] < least and clears(state, i):
+            least = ACCEPT
         out.append(least)
     return out
+
+
+def are_plain(a: AbstractEffect, b: AbstractEffect) -> bool:
+    """Whether two effects are Coulomb's and viscous friction of one joint."""
+    return a.joints == b.joints and {called(a), called(b)} == {CoulombFriction.name, ViscousFriction.name}
+
+
+def clears(state: State, i: int) -> bool:
+    """Whether a law of one joint takes away nearly all that the other terms leave there."""
+    effect = state.terms[i].effect
+    if not isinstance(effect, AbstractJointEffect) or effect.bound_to_recording or effect.name == "unknown":
+        return False
+    j = effect.joints[0]
+    left = [
+        np.sum(d.left[j] ** 2) / max(np.count_nonzero(d.left[j]), 1) - 1
+        for d in (state.design, without(state, i))
+    ]
+    return bool(left[1] > UNEXPLAINED and left[0] < CLEARED * left[1])

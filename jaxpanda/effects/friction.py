@@ -93,10 +93,11 @@ class AsymmetricFriction(AbstractDryFriction):
     r"""Friction that differs between the directions.
 
     $$\tau_j = F_c \tanh(\dot q_j / v_0) + \Delta_c \tanh^2(\dot q_j / v_0)
-      \quad\text{or}\quad F_v \dot q_j + \Delta_v |\dot q_j|$$
+      + F_v \dot q_j + \Delta_v |\dot q_j|$$
 
-    Zero at rest, which is what tells it from the offset of a torque sensor. Form "extra" leaves out the
-    symmetric part, for a joint whose model holds it already.
+    Zero at rest, which is what tells it from the offset of a torque sensor. Form "whole" has the first two parts,
+    "viscous" the last two, "both" all; "... extra" leaves out the symmetric part, for a joint whose model holds
+    it already.
     """
 
     name: ClassVar[str] = "asymmetric_friction"
@@ -125,7 +126,7 @@ class AsymmetricFriction(AbstractDryFriction):
             "extra": (difference,),
             "viscous": (slope, bend),
             "viscous extra": (bend,),
-            "both": (level, difference, bend),
+            "both": (level, difference, slope, bend),
         }[self.form]
 
     @property
@@ -138,7 +139,7 @@ class AsymmetricFriction(AbstractDryFriction):
                 "viscous": "damping * dq + damping_asymmetry * |dq|",
                 "viscous extra": "damping_asymmetry * |dq|",
                 "both": "coulomb * tanh(dq / v0) + coulomb_asymmetry * tanh(dq / v0)^2"
-                " + damping_asymmetry * |dq|",
+                " + damping * dq + damping_asymmetry * |dq|",
             }[self.form]
         )
 
@@ -151,7 +152,7 @@ class AsymmetricFriction(AbstractDryFriction):
                 "extra": [sign],
                 "viscous": [none, none],
                 "viscous extra": [none],
-                "both": [one, sign, none],
+                "both": [one, sign, none, none],
             }[self.form]
         )
 
@@ -164,7 +165,7 @@ class AsymmetricFriction(AbstractDryFriction):
                 "extra": [none],
                 "viscous": [qd, bend],
                 "viscous extra": [bend],
-                "both": [none, none, bend],
+                "both": [none, none, qd, bend],
             }[self.form]
         )
 

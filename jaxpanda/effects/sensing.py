@@ -94,7 +94,7 @@ class TorqueDrift(AbstractInstantEffect):
     After `until` [s], the end of what was recorded, it goes on as `settling` says. Form "extra" is without the
     constant; "wave" is $a\,t + b + s \sin(2\pi t/T) + c \cos(2\pi t/T)$, a bias that wanders; "wandering" adds
     half the period to it. What wanders goes on to nobody knows where: after `until` it returns to its mean within
-    $T/2\pi$.
+    $T/2\pi$, or stays where it is if less than T was recorded.
     """
 
     name: ClassVar[str] = "torque_drift"
@@ -151,7 +151,10 @@ class TorqueDrift(AbstractInstantEffect):
             ends = [k * self.until for k in waves]
             means = [m for x in ends for m in ((1 - jnp.cos(x)) / x, jnp.sin(x) / x)]
             mean = jnp.stack([0.5 * self.until * one, one, *means])
-            return mean + (jnp.stack(now) - mean) * jnp.exp(-w * jnp.maximum(s.t - self.until, 0.0))
+            kept = jnp.where(
+                self.time_constant > self.until, 1.0, jnp.exp(-w * jnp.maximum(s.t - self.until, 0.0))
+            )
+            return mean + (jnp.stack(now) - mean) * kept
         g = settling(s.t, self.time_constant, self.until)
         return jnp.stack([g] if self.form == "extra" else [g, one])
 
