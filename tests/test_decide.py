@@ -159,6 +159,27 @@ def test_friction_and_damping_together_are_no_stribeck_friction(size):
 
 
 @pytest.mark.slow
+def test_an_offset_beside_friction_is_no_asymmetric_friction():
+    """One law had as much evidence as an offset with damping, and took its place at 0.99."""
+    both = lambda t, q, qd, qdd: np.eye(7)[3] * (1.2 * qd[:, [3]] + 0.3)
+    found = diagnose(None, [record(20, both), record(21, both)]).findings
+    assert {(f.effect, f.joints) for f in found} == {("viscous_friction", (3,)), ("torque_offset", (3,))}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exponent", [0.5, 2.0])
+def test_friction_with_a_power_of_the_speed_is_found(exponent):
+    """It was called a drift of friction, or had no name."""
+    rubs = lambda t, q, qd, qdd: np.eye(7)[3] * np.sign(qd[:, [3]]) * np.abs(qd[:, [3]]) ** exponent
+    (found,) = diagnose(None, [record(20, rubs), record(21, rubs)]).findings
+    assert (found.effect, found.joints) == ("power_law_friction", (3,))
+    number = {p["name"]: (p["value"], p["std"]) for p in found.parameters}
+    for name, true in (("exponent", exponent), ("friction_at_1_rad_s", 1.0)):
+        value, std = number[name]
+        assert abs(value - true) < 3 * std < 0.4 * true
+
+
+@pytest.mark.slow
 def test_damping_that_differs_between_the_directions_with_the_level_is_one_finding():
     """Its damping, common to both directions, was left out, and a third of the torque at speed with it."""
 

@@ -32,7 +32,7 @@ from jaxpanda.effects.twist import Law, twist_torque
 from jaxpanda.effects.unknown import Unknown, UnknownAt, UnknownOfTwo
 
 NAMES = {
-    "viscous_friction", "coulomb_friction", "asymmetric_friction", "stribeck_friction",
+    "viscous_friction", "coulomb_friction", "power_law_friction", "asymmetric_friction", "stribeck_friction",
     "load_dependent_friction", "friction_drift", "presliding_hysteresis", "torque_ripple", "backlash",
     "joint_elasticity", "armature",
     "inertial_parameters", "payload", "payload_change", "gravity_direction", "joint_spring", "torque_offset",

@@ -45,6 +45,8 @@ from .unnamed import BEYOND
 NEXT_MOTION = "next_motion.csv"
 UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""
+UNSURE, MISSED = 0.6, 2.0
+"""Confidence that no finding reaches, and held-out error over the noise, where not all is taken for explained."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,6 +235,7 @@ def diagnose(
     found = (*found, *wrong)
     corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
     corrected = _buildable(source, corrected, problem)
+    fitted = fit(problem, kept)
     if any(lost):
         dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
         premises = dataclasses.replace(
@@ -244,9 +247,9 @@ def diagnose(
     written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
-        verdict=_verdict(found, partly(state)),
+        verdict=_verdict(found, fitted, partly(state)),
         findings=found,
-        fit=fit(problem, kept),
+        fit=fitted,
         corrected=corrected,
         written=written,
         notes=(
@@ -366,13 +369,15 @@ def _rms(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.sqrt(np.mean(stacked**2, 0)) if len(stacked) else np.zeros(stacked.shape[1])
 
 
-def _verdict(found: Sequence[Finding], partly: bool) -> str:
+def _verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
     names = [f.effect for f in found]
     if not names:
         return "consistent"
     if "unknown" not in names:
         doubtful = any(f.confidence < DOUBTFUL for f in found)
-        return "partly_explained" if partly or doubtful else "explained"
+        missed = bool(np.any(fit.held_out_rmse_after > MISSED * fit.noise_floor))
+        unsure = missed and all(f.confidence < UNSURE for f in found)
+        return "partly_explained" if partly or doubtful or unsure else "explained"
     return "unexplained" if set(names) == {"unknown"} else "partly_explained"
 
 

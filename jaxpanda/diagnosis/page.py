@@ -26,6 +26,7 @@ _BEFORE, _AFTER, _FIT = "#e08a1e", "#1f6fb2", "#b3202a"
 _AGAINST = {
     "viscous_friction": "velocity",
     "coulomb_friction": "velocity",
+    "power_law_friction": "velocity",
     "asymmetric_friction": "velocity",
     "stribeck_friction": "velocity",
     "load_dependent_friction": "|load|, turned by direction",

@@ -27,6 +27,7 @@ USUAL = {
     "stribeck_friction": -3.0,
     "load_dependent_friction": -3.0,
     "friction_drift": -3.0,
+    "power_law_friction": -3.0,
     "joint_spring": -3.0,
     "torque_drift": -3.0,
     "external_contact": -12.0,
@@ -36,9 +37,16 @@ USUAL = {
 }
 """Prior over that of the others [nats]. Laws that hold a simpler one as a special case must earn what they add;
 what moves a link by its load or in time is made of the same noise of q, differentiated twice, as the residual."""
-_RICHER = ("asymmetric_friction", "stribeck_friction", "load_dependent_friction", "friction_drift")
+_RICHER = (
+    "asymmetric_friction",
+    "stribeck_friction",
+    "load_dependent_friction",
+    "friction_drift",
+    "power_law_friction",
+)
 RICHER_SHARE = 0.001
-"""Share of the evidence that laws which hold Coulomb's as a special case must win by: the real one is neither."""
+"""Share of the evidence that laws which hold a simpler one as a special case must win by: the real one is
+neither."""
 _REFINED = 7
 _ORDERS = 8
 CLOSE = 0.5

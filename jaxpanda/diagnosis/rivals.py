@@ -6,7 +6,7 @@ import numpy as np
 import scipy.special
 
 from ..effects import AbstractEffect
-from ..effects.friction import CoulombFriction
+from ..effects.friction import CoulombFriction, PowerLawFriction, ViscousFriction
 from ..effects.memory import PreslidingHysteresis
 from .events import Proposal
 
@@ -20,6 +20,7 @@ HOLDS = {
     "inertial_parameters": ("payload",),
     "torque_drift": ("torque_offset",),
     "joint_spring": ("torque_offset",),
+    "power_law_friction": ("viscous_friction",),
     **dict.fromkeys(
         ("asymmetric_friction", "stribeck_friction", "load_dependent_friction", "friction_drift"),
         ("viscous_friction", "coulomb_friction"),
@@ -31,9 +32,12 @@ SPECIAL = 2.0
 
 
 def called(effect: AbstractEffect) -> str:
-    """The name of what an effect is: friction that builds up over a hair's breadth is Coulomb's, and sticks."""
+    """The name of what an effect is: friction that builds up over a hair's breadth is Coulomb's, and sticks; with
+    about the first power of the speed it is viscous."""
     if isinstance(effect, PreslidingHysteresis) and effect.sticks:
         return CoulombFriction.name
+    if isinstance(effect, PowerLawFriction) and effect.is_viscous:
+        return ViscousFriction.name
     return effect.name
 
 

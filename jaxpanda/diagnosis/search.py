@@ -10,8 +10,9 @@ from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import TorqueRipple
 from ..effects.effect import AbstractDryFriction
-from ..effects.friction import CoulombFriction, ViscousFriction
+from ..effects.friction import AsymmetricFriction, CoulombFriction, ViscousFriction
 from ..effects.load import EVER, InertialParameters, Payload, PayloadChange
+from ..effects.sensing import TorqueOffset
 from .credible import has_play, is_dissipative, is_event, is_of_time
 from .events import Proposal
 from .evidence import Design, Noise
@@ -389,30 +390,42 @@ def handed_over(problem: Problem, state: State, say: Any) -> State:
 
 
 def taken_apart(problem: Problem, state: State, say: Any) -> State:
-    """Coulomb's and viscous friction in the place of a law that holds both, where they do about as well.
+    """Coulomb's and viscous friction in the place of a law that holds both, where they do about as well; and of
+    friction that differs between the directions where they do better with an offset.
 
-    No rival of that law shows that it is not needed: each of them alone lacks the other.
+    No rival of that law shows that it is not needed: each of them alone lacks the others.
     """
-    simple = (CoulombFriction.name, ViscousFriction.name)
+    plain = (CoulombFriction.name, ViscousFriction.name)
     for i, term in enumerate(state.terms):
-        if not set(simple) <= set(HOLDS.get(term.effect.name, ())):
+        if not set(plain) <= set(HOLDS.get(term.effect.name, ())):
             continue
-        others, parts = (*state.terms[:i], *state.terms[i + 1 :]), dict[str, Term]()
-        groups = [g for g in problem.library if (g.joint,) == term.effect.joints]
-        new = [name for name in simple if all(t.key != (name, term.effect.joints) for t in others)]
-        for name in (*new, *new[:1]):  # the first once more, beside the second
-            beside = problem.design((*others, *(p for n, p in parts.items() if n != name)), state.noise)
-            (best,) = grids(problem, beside, state.noise, [g for g in groups if g.name == name])
-            best = refine(problem, beside, state.noise, best)
-            parts[name] = problem.term(best.effect, best.deviation)
-        apart = problem.design((*others, *parts.values()), state.noise)
-        gained = apart.log_evidence - state.design.log_evidence
         whole = state.design.log_evidence - without(state, i).log_evidence
-        if gained > -max(SPECIAL * TEMPERATURE, RICHER_SHARE * whole):
-            say(f"{term.key} taken apart into Coulomb's and viscous friction: {gained:.1f}")
-            state = prune(problem, with_terms(problem, (*others, *parts.values())), say)
-            return taken_apart(problem, state, say)
+        ways: list[tuple[tuple[str, ...], float]] = [
+            (plain, max(SPECIAL * TEMPERATURE, RICHER_SHARE * whole))
+        ]
+        if isinstance(term.effect, AsymmetricFriction):
+            ways.append(((*plain, TorqueOffset.name), -0.5 * ACCEPT))
+        for names, allowed in ways:
+            terms = _parts(problem, state, i, names)
+            gained = problem.design(terms, state.noise).log_evidence - state.design.log_evidence
+            if gained > -allowed:
+                say(f"{term.key} taken apart into {', '.join(names)}: {gained:.1f}")
+                return taken_apart(problem, prune(problem, with_terms(problem, terms), say), say)
     return state
+
+
+def _parts(problem: Problem, state: State, i: int, names: Sequence[str]) -> list[Term]:
+    """The terms with effects of these names, fitted beside each other, in the place of one at its joint."""
+    others, parts = (*state.terms[:i], *state.terms[i + 1 :]), dict[str, Term]()
+    joints = state.terms[i].effect.joints
+    groups = [g for g in problem.library if (g.joint,) == joints]
+    new = [name for name in names if all(t.key != (name, joints) for t in others)]
+    for name in (*new, *new[:1]):  # the first once more, beside the rest
+        beside = problem.design((*others, *(p for n, p in parts.items() if n != name)), state.noise)
+        (best,) = grids(problem, beside, state.noise, [g for g in groups if g.name == name])
+        best = refine(problem, beside, state.noise, best)
+        parts[name] = problem.term(best.effect, best.deviation)
+    return [*others, *parts.values()]
 
 
 def held_evidence(problem: Problem, state: State, i: int) -> float:

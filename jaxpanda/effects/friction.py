@@ -23,6 +23,10 @@ from .motion import Channels, Joint
 _WIDTH = Shape("v0", "rad/s", 1e-3, 0.3)
 
 
+PROPORTIONAL = 1.25
+"""Exponent of the speed, or one over it, up to which friction is called proportional to it."""
+
+
 class ViscousFriction(AbstractInstantEffect):
     r"""Friction proportional to velocity, $\tau_j = F_v\,\dot q_j$.
 
@@ -87,6 +91,46 @@ class CoulombFriction(AbstractDryFriction):
 
     def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         return {"frictionloss": {int(self.joint): c[0]}}
+
+
+class PowerLawFriction(AbstractDryFriction):
+    r"""Friction that grows with a power of the speed, $\tau_j = F_p\,|\dot q_j|^p \tanh(\dot q_j / v_0)$.
+
+    Churned oil takes p near 2, a warm film of grease p below 1; with p near 1 it is viscous friction, and called
+    so.
+
+    References:
+        Olsson, Åström, Canudas de Wit, Gäfvert, Lischinsky, European Journal of Control 1998.
+    """
+
+    name: ClassVar[str] = "power_law_friction"
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("exponent", "1", 0.35, 3.0),)
+    reveals: ClassVar[str] = ViscousFriction.reveals
+    confounded_with: ClassVar[tuple[str, ...]] = ("viscous_friction", "coulomb_friction", "stribeck_friction")
+
+    joint: Joint
+    exponent: Float[Array, ""] | float
+    v0: Float[Array, ""] | float = 0.005
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["PowerLawFriction"]:
+        return [cls(joint=j, exponent=p) for p in (0.5, 0.7, 1.5, 2.0, 2.5) for j in range(arm.dof)]
+
+    @property
+    def is_viscous(self) -> bool:
+        """Whether it is all but proportional to the speed."""
+        return 1 / PROPORTIONAL < float(self.exponent) < PROPORTIONAL
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("friction_at_1_rad_s", "N·m", sign=1),)
+
+    @property
+    def equation(self) -> str:
+        return "tau = friction_at_1_rad_s * |dq|^exponent * sign(dq)"
+
+    def levels(self, s: Channels) -> Float[Array, " n"]:
+        return ((jnp.abs(s.qd[self.joint]) + 1e-9) ** self.exponent)[None]
 
 
 class AsymmetricFriction(AbstractDryFriction):
@@ -428,6 +472,7 @@ class FrictionDrift(AbstractDryFriction):
 EFFECTS = (
     ViscousFriction,
     CoulombFriction,
+    PowerLawFriction,
     AsymmetricFriction,
     StribeckFriction,
     LoadDependentFriction,
