@@ -11,19 +11,18 @@ from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.credible import is_of_time
 from jaxpanda.diagnosis.decide import UNLIKELY, WANDERS, crowd, findings, unnamed_where_doubtful
-from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.next_motion import next_motion
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.proposals import grids, handicapped, ranked
 from jaxpanda.diagnosis.rivals import ACCEPT
 from jaxpanda.diagnosis.search import divided, most_helpful
-from jaxpanda.diagnosis.shapes import first_steps, refine
+from jaxpanda.diagnosis.shapes import refine
 from jaxpanda.diagnosis.state import SHADOW, floors, gains, helped_over, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.drive import JointSpring, TorqueRipple
-from jaxpanda.effects.friction import CoulombFriction, FrictionDrift
+from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.sensing import TorqueDrift, TorqueOffset
 from jaxpanda.effects.unknown import Unknown
 
@@ -192,18 +191,6 @@ def test_damping_that_differs_between_the_directions_with_the_level_is_one_findi
     number = {p["name"]: p["value"] for p in found.parameters}
     expected = {"coulomb": 1.0, "coulomb_asymmetry": 0.4, "damping": 0.6, "damping_asymmetry": 0.24}
     assert {n: number[n] for n in expected} == pytest.approx(expected, rel=0.1)
-
-
-def test_a_shape_far_from_the_grid_is_reached():
-    """Friction that turns over 0.25 rad/s, far from the grid's 0.03, was called another law."""
-    wide = lambda t, q, qd, qdd: np.eye(7)[3] * (5.0 * np.exp(-t / 6.0))[:, None] * np.tanh(qd[:, [3]] / 0.25)
-    problem = posed(record(20, wide, seconds=16.0))
-    state, begin = start(problem), FrictionDrift(3, 20.0, 0.02, "level")
-    first = Proposal(begin, 0.0, 0.0, np.ones(2), first_steps(begin))
-    drift = refine(problem, state.design, state.noise, first)
-    assert isinstance(drift.effect, FrictionDrift)
-    assert float(drift.effect.v0) == pytest.approx(0.25, rel=0.1)
-    assert float(drift.effect.time_constant) == pytest.approx(6.0, rel=0.2)
 
 
 @pytest.mark.parametrize(

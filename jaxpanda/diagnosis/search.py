@@ -1,5 +1,6 @@
 """Which effects, where, in which shape: greedy selection by evidence, everything refitted at every step."""
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -163,7 +164,7 @@ def grow(problem: Problem, state: State, say: Any, *, lasting: bool = False, lin
         if worthy is None:
             break
         state = with_terms(problem, (*state.terms, problem.term(worthy.effect, worthy.deviation)))
-        state = handed_over(problem, settle(problem, state), say)
+        state = handed_over(problem, settle(problem, completed(problem, state)), say)
         joints = set(np.flatnonzero(shares(state)[-1] > _FELT).tolist())
     return state
 
@@ -232,6 +233,17 @@ def most_helpful(problem: Problem, state: State, proposals: Sequence[Proposal], 
 
     wide = [p for p in proposals if len(p.effect.joints) > 1]
     return likeliest(wide) or likeliest([p for p in proposals[:_TRIED] if len(p.effect.joints) == 1])
+
+
+def completed(problem: Problem, state: State) -> State:
+    """Damping common to both directions joins friction that differs between them, where it has evidence."""
+    term = state.terms[-1]
+    if not isinstance(term.effect, AsymmetricFriction) or term.effect.form != "both":
+        return state
+    full = dataclasses.replace(term.effect, form="full")
+    _, deviation = evidence_of(problem, without(state, len(state.terms) - 1), state.noise, full)
+    other = with_terms(problem, (*state.terms[:-1], problem.term(full, deviation)))
+    return other if gained_over(problem, other, state) > ACCEPT else state
 
 
 def settle(problem: Problem, state: State) -> State:

@@ -14,13 +14,9 @@ from .events import BIN, Proposal
 from .evidence import Design, Noise, gram, log_bayes
 from .library import form_of
 from .problem import Problem
-from .rivals import RELATIVE_TEMPERATURE
 from .scan import scales_of
 
-_ROUNDS, _LONGER = 4, 1.6
-"""Of a pattern search, and what a step that gained grows by."""
-_PAID = 3.0
-"""What a form must win by over another, at least, for every shape parameter that it has more [nats]."""
+_ROUNDS = 4
 
 
 def clock(problem: Problem, recording: str) -> Float[np.ndarray, " time"]:
@@ -107,8 +103,7 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
         other = best_shape(problem, design, noise, list(alike))
         if other[0].shapes and not effect.shapes:
             other = climbed(problem, design, noise, other[0], first_steps(other[0]))
-        more = len(other[0].shapes) - len(effect.shapes)
-        if other[1] > best + more * max(_PAID, RELATIVE_TEMPERATURE * best):
+        if other[1] > best:
             effect, best, deviation = other
     gained = best - proposal.best
     return dataclasses.replace(
@@ -128,7 +123,7 @@ def climbed(
     if not steps:
         return effect, best, deviation
     scale = np.array(steps)
-    for _ in range(_ROUNDS if len(steps) == 1 else _ROUNDS + 5):
+    for _ in range(_ROUNDS if len(steps) == 1 else _ROUNDS + 3):
         moves = [m * e for e in np.diag(scale) for m in (-1.0, 1.0, -0.4, 0.4)]
         if len(steps) > 1:
             moves += [np.array([a, b]) * scale[:2] for a in (-1, 1) for b in (-1, 1)]
@@ -138,7 +133,6 @@ def climbed(
             effect, best, deviation = tried
             if gained < 0.05:
                 break
-            scale = scale * _LONGER
         else:
             scale = scale * 0.35
     return effect, best, deviation

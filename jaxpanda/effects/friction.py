@@ -140,8 +140,9 @@ class AsymmetricFriction(AbstractDryFriction):
       + F_v \dot q_j + \Delta_v |\dot q_j|$$
 
     Zero at rest, which is what tells it from the offset of a torque sensor. Form "whole" has the first two parts,
-    "viscous" the last two, "both" all; "... extra" leaves out the symmetric part, for a joint whose model holds
-    it already.
+    "viscous" the last two, "full" all and "both" all but damping; "... extra" leaves out the symmetric part, for
+    a joint whose model holds it already. `grid` has no "full", which would take Coulomb's and viscous friction
+    for one law: the search tries it where "both" was found.
     """
 
     name: ClassVar[str] = "asymmetric_friction"
@@ -170,7 +171,8 @@ class AsymmetricFriction(AbstractDryFriction):
             "extra": (difference,),
             "viscous": (slope, bend),
             "viscous extra": (bend,),
-            "both": (level, difference, slope, bend),
+            "both": (level, difference, bend),
+            "full": (level, difference, bend, slope),
         }[self.form]
 
     @property
@@ -183,6 +185,8 @@ class AsymmetricFriction(AbstractDryFriction):
                 "viscous": "damping * dq + damping_asymmetry * |dq|",
                 "viscous extra": "damping_asymmetry * |dq|",
                 "both": "coulomb * tanh(dq / v0) + coulomb_asymmetry * tanh(dq / v0)^2"
+                " + damping_asymmetry * |dq|",
+                "full": "coulomb * tanh(dq / v0) + coulomb_asymmetry * tanh(dq / v0)^2"
                 " + damping * dq + damping_asymmetry * |dq|",
             }[self.form]
         )
@@ -196,7 +200,8 @@ class AsymmetricFriction(AbstractDryFriction):
                 "extra": [sign],
                 "viscous": [none, none],
                 "viscous extra": [none],
-                "both": [one, sign, none, none],
+                "both": [one, sign, none],
+                "full": [one, sign, none, none],
             }[self.form]
         )
 
@@ -209,7 +214,8 @@ class AsymmetricFriction(AbstractDryFriction):
                 "extra": [none],
                 "viscous": [qd, bend],
                 "viscous extra": [bend],
-                "both": [none, none, qd, bend],
+                "both": [none, none, bend],
+                "full": [none, none, bend, qd],
             }[self.form]
         )
 
