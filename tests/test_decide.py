@@ -11,6 +11,7 @@ from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.credible import is_of_time
 from jaxpanda.diagnosis.decide import UNLIKELY, WANDERS, crowd, findings, unnamed_where_doubtful
+from jaxpanda.diagnosis.diagnosis import Fit, verdict
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.next_motion import next_motion
 from jaxpanda.diagnosis.premises import pose
@@ -173,7 +174,7 @@ def test_friction_with_a_power_of_the_speed_is_found(exponent):
     (found,) = diagnose(None, [record(20, rubs), record(21, rubs)]).findings
     assert (found.effect, found.joints) == ("power_law_friction", (3,))
     number = {p["name"]: (p["value"], p["std"]) for p in found.parameters}
-    for name, true in (("exponent", exponent), ("friction_at_1_rad_s", 1.0)):
+    for name, true in (("exponent", exponent), ("friction_at_unit_speed", 1.0)):
         value, std = number[name]
         assert abs(value - true) < 3 * std < 0.4 * true
 
@@ -308,6 +309,33 @@ def test_what_acts_along_a_joint_that_slides_is_told_in_newtons_and_metres():
     assert " N rms" in slides.summary
 
 
+def found_as(effect, i, confidence):
+    return Finding(
+        effect=effect.name,
+        joints=effect.joints,
+        recordings=("motion_3.csv",),
+        intervals=None,
+        confidence=confidence,
+        alternatives=(("joint_spring", 0.01),),
+        equation=effect.equation,
+        parameters=(),
+        rms_torque=np.zeros(7),
+        evidence=100.0 - i,
+        summary="",
+        terms=(i,),
+    )
+
+
+def test_findings_that_are_not_sure_and_predict_poorly_explain_partly():
+    noise, effect = np.full(7, 0.05), TorqueOffset(0)
+    poor, good = (Fit(noise, noise, noise, factor * noise, noise) for factor in (2.5, 1.5))
+    unsure = [found_as(effect, 0, 0.55), found_as(effect, 1, 0.5)]
+    assert verdict(unsure, poor, False) == "partly_explained"
+    assert verdict(unsure, good, False) == "explained"
+    assert verdict([found_as(effect, 0, 0.9), unsure[1]], poor, False) == "explained"
+    assert verdict([], poor, False) == "consistent"
+
+
 def test_several_laws_of_which_none_is_likely_are_one_unknown():
     problem = posed(record(3))
     terms = [problem.term(CoulombFriction(1, 0.01), np.ones(1)), problem.term(TorqueOffset(4), np.ones(1))]
@@ -315,21 +343,7 @@ def test_several_laws_of_which_none_is_likely_are_one_unknown():
     state = with_terms(problem, terms)
 
     def finding(i, confidence):
-        effect = terms[i].effect
-        return Finding(
-            effect=effect.name,
-            joints=effect.joints,
-            recordings=("motion_3.csv",),
-            intervals=None,
-            confidence=confidence,
-            alternatives=(("joint_spring", 0.01),),
-            equation=effect.equation,
-            parameters=(),
-            rms_torque=np.zeros(7),
-            evidence=100.0 - i,
-            summary="",
-            terms=(i,),
-        )
+        return found_as(terms[i].effect, i, confidence)
 
     sure, doubtful = finding(2, 0.9), [finding(0, 0.9 * UNLIKELY), finding(1, 0.25 * UNLIKELY)]
     named, unknown = unnamed_where_doubtful(problem, state, [sure, *doubtful])

@@ -247,7 +247,7 @@ def diagnose(
     written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
-        verdict=_verdict(found, fitted, partly(state)),
+        verdict=verdict(found, fitted, partly(state)),
         findings=found,
         fit=fitted,
         corrected=corrected,
@@ -369,7 +369,8 @@ def _rms(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.sqrt(np.mean(stacked**2, 0)) if len(stacked) else np.zeros(stacked.shape[1])
 
 
-def _verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
+def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
+    """The answer in a word; `partly`: whether structure is left that the findings do not explain."""
     names = [f.effect for f in found]
     if not names:
         return "consistent"

@@ -123,11 +123,11 @@ class PowerLawFriction(AbstractDryFriction):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("friction_at_1_rad_s", "N·m", sign=1),)
+        return (Coefficient("friction_at_unit_speed", "N·m", sign=1),)
 
     @property
     def equation(self) -> str:
-        return "tau = friction_at_1_rad_s * |dq|^exponent * sign(dq)"
+        return "tau = friction_at_unit_speed * |dq|^exponent * sign(dq)"
 
     def levels(self, s: Channels) -> Float[Array, " n"]:
         return ((jnp.abs(s.qd[self.joint]) + 1e-9) ** self.exponent)[None]
