@@ -203,13 +203,7 @@ def is_worthy(problem: Problem, state: State, proposal: Proposal, say: Any) -> b
     least = floors(grown, [*gains(state), evidence])[-1]
     if evidence < least:
         say(f"{describe([proposal])} brings {evidence:.0f}, less than {least:.0f}: a shadow")
-        return False
-    if proposal.effect.name != "unknown":
-        return True
-    helped = problem.held_out_error(state.design) - problem.held_out_error(grown.design)
-    if helped < HELD_OUT:
-        say(f"{describe([proposal])}: held-out error falls by {helped:.1f} only")
-    return helped >= HELD_OUT
+    return bool(evidence >= least)
 
 
 def most_helpful(problem: Problem, state: State, proposals: Sequence[Proposal], say: Any) -> Proposal | None:
