@@ -8,6 +8,7 @@ import numpy as np
 
 from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.drive import TorqueRipple
+from ..effects.friction import ViscousFriction
 from ..effects.load import PayloadChange
 from ..effects.unknown import UnknownOfTwo
 from .credible import has_play, is_dissipative, is_event, is_of_time
@@ -16,6 +17,7 @@ from .evidence import Design, Noise, log_mean_exp
 from .host import parallel
 from .library import Candidates
 from .problem import Problem
+from .rivals import HOLDS
 from .shapes import best_shape, climbed, first_steps, refine
 
 UNKNOWN_MARGIN, UNKNOWN_SHARE = 10.0, 0.06
@@ -37,13 +39,7 @@ USUAL = {
 }
 """Prior over that of the others [nats]. Laws that hold a simpler one as a special case must earn what they add;
 what moves a link by its load or in time is made of the same noise of q, differentiated twice, as the residual."""
-_RICHER = (
-    "asymmetric_friction",
-    "stribeck_friction",
-    "load_dependent_friction",
-    "friction_drift",
-    "power_law_friction",
-)
+_RICHER = tuple(name for name, held in HOLDS.items() if ViscousFriction.name in held)
 RICHER_SHARE = 0.001
 """Share of the evidence that laws which hold a simpler one as a special case must win by: the real one is
 neither."""

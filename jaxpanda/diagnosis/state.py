@@ -92,11 +92,13 @@ def leftover(state: State) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray,
     design, terms = state.design, places(state)
     kept = np.arange(len(design.precision)) < (terms[0].start if terms else len(design.precision))
     bare = Design([A[:, kept] for A in design.columns], design.residual, design.precision[kept])
-    out = []
-    for d in (bare, design):
-        left = [r - A @ d.x for A, r in zip(d.columns, d.residual, strict=True)]
-        out.append(np.array([np.sum(e**2) / max(np.count_nonzero(e), 1) - 1 for e in left]))
-    return out[0], out[1]
+    before, after = (np.array([_beyond(e) for e in d.left]) for d in (bare, design))
+    return before, after
+
+
+def _beyond(left: Float[np.ndarray, " rows"]) -> float:
+    """Mean square of what is left of a joint, whitened, beyond the noise's; rows that do not count are zero."""
+    return float(np.sum(left**2)) / max(np.count_nonzero(left), 1) - 1
 
 
 def energies(state: State) -> Float[np.ndarray, "terms dof rows"]:
@@ -167,8 +169,5 @@ def clears(state: State, i: int) -> bool:
     if not isinstance(effect, AbstractJointEffect) or effect.bound_to_recording or effect.name == "unknown":
         return False
     j = effect.joints[0]
-    left = [
-        np.sum(d.left[j] ** 2) / max(np.count_nonzero(d.left[j]), 1) - 1
-        for d in (state.design, without(state, i))
-    ]
+    left = [_beyond(d.left[j]) for d in (state.design, without(state, i))]
     return bool(left[1] > UNEXPLAINED and left[0] < CLEARED * left[1])
