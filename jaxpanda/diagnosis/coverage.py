@@ -22,8 +22,7 @@ from .events import Proposal, ripple
 from .evidence import Design, Noise
 from .library import Candidates
 from .problem import Problem
-from .proposals import USUAL, grids
-from .rivals import ACCEPT
+from .proposals import grids
 from .state import State
 
 _PAID = 7.0
@@ -294,7 +293,7 @@ def _least(
         size = np.sqrt(felt / np.maximum(sum(a.sum(0) for a in acting), 1)[:, None]).max(0)
     left = np.maximum(np.diagonal(G, axis1=1, axis2=2), 0.0)
     share = left / np.maximum(raw, 1e-300)
-    delta = 2 * (ACCEPT + _PAID - USUAL.get(effect.name, 0.0))
+    delta = 2 * (_PAID - effect.prior)
     joint = effect.joints[0] if len(effect.joints) == 1 else None
     coefficient = effect.coefficients[0]
     name = {"external_contact": "force", "gravity_direction": "gravity"}.get(effect.name, coefficient.name)

@@ -11,7 +11,6 @@ from ..effects.sensing import TorqueDrift
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem
-from .rivals import ACCEPT
 from .shapes import clock, projection
 
 LASTING = 0.8
@@ -21,6 +20,14 @@ CLEAR = 4.0
 """Standard deviations by which a gap must differ from none."""
 AFRESH = 0.1
 """What of a drift differs at least between two repeats of a motion, as a share of what comes again."""
+
+
+def is_credible(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
+    """Whether a proposal is what it calls itself."""
+    tests = is_dissipative, has_play, is_of_time
+    return is_event(problem, proposal.effect) and all(
+        test(problem, design, noise, proposal) for test in tests
+    )
 
 
 def is_event(problem: Problem, effect: AbstractEffect) -> bool:
@@ -41,7 +48,7 @@ def is_dissipative(problem: Problem, design: Design, noise: Noise, proposal: Pro
     effect = proposal.effect
     if not isinstance(effect, AsymmetricFriction):
         return True
-    j, (c, _) = effect.joints[0], _fitted(problem, design, noise, proposal)
+    j, (c, _) = effect.joints[0], fitted(problem, design, noise, proposal)
     power = [
         (x[:, 0] @ c + t.motion.friction[:, j]) * t.motion.qd[:, j]
         for x, t in zip(problem.columns([effect]), problem.traces, strict=True)
@@ -55,9 +62,9 @@ def has_play(problem: Problem, design: Design, noise: Noise, proposal: Proposal)
 
     Swings alone, with no motion lost, are what an elastic joint makes of noise.
     """
-    if not isinstance(proposal.effect, Backlash) or proposal.evidence < ACCEPT:
+    if not isinstance(proposal.effect, Backlash) or proposal.evidence < 0:
         return True
-    c, covariance = _fitted(problem, design, noise, proposal)
+    c, covariance = fitted(problem, design, noise, proposal)
     return bool(c[0] > CLEAR * np.sqrt(covariance[0, 0]))
 
 
@@ -67,12 +74,12 @@ def is_of_time(problem: Problem, design: Design, noise: Noise, proposal: Proposa
     What comes again with the motion, and is no steady law of the drift's kind, is some function of the motion.
     """
     effect = proposal.effect
-    if not isinstance(effect, TorqueDrift | FrictionDrift) or proposal.evidence < ACCEPT:
+    if not isinstance(effect, TorqueDrift | FrictionDrift) or proposal.evidence < 0:
         return True
     shifts = [round(t.signals.period / t.motion.dt) if t.signals.period else 0 for t in problem.traces]
     if not any(shifts):
         return True
-    j, (c, _) = effect.joints[0], _fitted(problem, design, noise, proposal)
+    j, (c, _) = effect.joints[0], fitted(problem, design, noise, proposal)
     whitened = lambda one: problem.whitened(problem.columns([one]), noise, j)[:, 0]
     steady = [whitened(law) for law in effect.steady]
     parts = np.column_stack([design.left[j], whitened(effect) @ c, *steady])
@@ -90,7 +97,7 @@ def is_of_time(problem: Problem, design: Design, noise: Noise, proposal: Proposa
     return told >= AFRESH * float(np.sum((drift - law @ np.linalg.lstsq(law, drift)[0]) ** 2))
 
 
-def _fitted(
+def fitted(
     problem: Problem, design: Design, noise: Noise, proposal: Proposal
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
     """A proposal's coefficients beside what is in the model, and their covariance."""

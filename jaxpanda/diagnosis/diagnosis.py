@@ -36,13 +36,15 @@ from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
-from .search import ELECTIONS, elected, transferable
-from .state import State
+from .search import transferable
+from .state import State, with_terms
 from .traces import Trace, prepare
 from .uncertainty import polished
 from .unnamed import BEYOND
 
 NEXT_MOTION = "next_motion.csv"
+LOOSE = 20.0
+"""Multiple of an identification's uncertainty up to which numbers are those of a poorer motion, and no finding."""
 UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""
 UNSURE, MISSED = 0.6, 2.0
@@ -222,16 +224,12 @@ def diagnose(
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
     problem = premises.problem
     state = polished(problem, state)
-    for _ in range(ELECTIONS):
-        other = elected(problem, state, log.append)
-        if other is state:
-            break
-        state = polished(problem, other)
-    kept = transferable(problem, state)
-    lost = [all(t is not k for k in kept.terms) for t in state.terms]
+    laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
+    kept = transferable(problem, laws)
+    lost = [all(t is not k for k in kept.terms) for t in laws.terms]
     found = tuple(findings(problem, state, lost))
-    contradicted = premises.knowledge != knowledge
-    wrong = numbers(problem, state, premises.changes) if contradicted and not found else []
+    contradicted = premises.knowledge != knowledge or premises.scale > LOOSE
+    wrong = numbers(problem, state, premises.changes) if contradicted else []
     found = (*found, *wrong)
     corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
     corrected = _buildable(source, corrected, problem)
@@ -284,7 +282,7 @@ def _still(trace: Trace) -> list[str]:
 
 def _turned(problem: Problem, state: State) -> list[str]:
     """A sentence about the joints whose known friction turns otherwise than MuJoCo's, beyond the noise."""
-    at = problem.turning
+    at = problem.known_off
     torque = np.concatenate([N[:, :, at] @ state.design.x[at] for N in problem.nuisance])
     joints = [str(j + 1) for j in np.flatnonzero(np.mean(torque**2, 0) > BEYOND * state.noise.std**2)]
     if not joints:
@@ -325,7 +323,7 @@ def _errors(problem: Problem, state: State) -> tuple[list[np.ndarray], list[np.n
     explained = []
     for i, (n, t) in enumerate(zip(problem.nuisance, problem.traces, strict=True)):
         columns = np.concatenate([n, *(term.columns[i] for term in state.terms)], 2)
-        explained.append((columns @ problem.explained(state.design.x)) * t.weight[:, None])
+        explained.append((columns @ problem.explained(state.design.x, state.terms)) * t.weight[:, None])
     return before, [b - e for b, e in zip(before, explained, strict=True)]
 
 
@@ -358,7 +356,8 @@ def held_out(problem: Problem, state: State) -> list[tuple[np.ndarray, np.ndarra
             dataclasses.replace(t, weight=t.weight * train)
             for t, (train, _) in zip(problem.traces, splits, strict=True)
         )
-        x = problem.explained(dataclasses.replace(problem, traces=traces).design(state.terms, state.noise).x)
+        fitted = dataclasses.replace(problem, traces=traces).design(state.terms, state.noise)
+        x = problem.explained(fitted.x, state.terms)
         for r, (_, test) in enumerate(splits):
             out[r][0][test] -= everything[r][test] @ x
     return out

@@ -204,7 +204,7 @@ def _binned(
     if ("windows", r) not in here.blocks:
         contacts = trace.motion.wrench_columns[:, :, joint].reshape(trace.motion.samples, -1)
         F = noise.whiten(np.concatenate([contacts, payload.over(trace.motion)[:, joint]], 1), joint)
-        F = split(F * trace.weights[:, joint, None])
+        F = split(F * problem.weights(noise, r, joint)[:, None])
         apart = F[:, :, : contacts.shape[1]].reshape(*F.shape[:2], -1, 6).swapaxes(1, 2)
         whole = F[:, :, contacts.shape[1] :]
         grams = apart.swapaxes(2, 3) @ apart, whole.swapaxes(1, 2) @ whole
@@ -214,7 +214,7 @@ def _binned(
     place = here.nuisance.shape[1]
     C[:, :place] = kept["nuisance"]
     for term in design.terms:
-        width, A = len(term.deviation), here.terms[id(term)][1]
+        width, A = term.width, here.terms[id(term)][1]
         if A is not None:
             if id(term) not in kept:
                 kept[id(term)] = with_model(A, F)
@@ -246,5 +246,7 @@ def _events(effects, found, clock, pairs) -> Iterator[Proposal]:
         if isinstance(effect, PayloadChange):
             start, stop = start if effect.form != "lost" else -EVER, stop if effect.form != "gained" else EVER
         placed = dataclasses.replace(effect, start=start, stop=stop)
-        evidence = float(log_mean_exp(score))
-        yield Proposal(placed, evidence, float(score[top]), deviation[0] * scale[top], (BIN, BIN))
+        evidence = float(log_mean_exp(score)) + placed.form_prior
+        yield Proposal(
+            placed, evidence, float(score[top]) + placed.form_prior, deviation[0] * scale[top], (BIN, BIN)
+        )

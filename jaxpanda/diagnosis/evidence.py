@@ -36,6 +36,12 @@ class Noise:
     sigma: Float[np.ndarray, " dof"]
     std: Float[np.ndarray, " dof"]
     """Of the noise itself [N m]."""
+    trust: Float[np.ndarray, "rows dof"] | None = None
+    """What a sample weighs beside what laws may be off there, 0 to 1; None where there are no laws."""
+
+    def trusted(self, rows: slice, joint: int) -> Float[np.ndarray, " _rows"] | float:
+        """Weights of some rows, all recordings one below the other."""
+        return 1.0 if self.trust is None else self.trust[rows, joint]
 
     def whiten(self, x: Float[np.ndarray, "_time ..."], joint: int) -> Float[np.ndarray, "_time ..."]:
         """x with unit, uncorrelated noise; the first rows are zero."""
@@ -87,9 +93,9 @@ class Design:
 
     def without(self, i: int) -> "Design":
         """The model less one of its terms."""
-        first = len(self.precision) - sum(len(t.deviation) for t in self.terms[i:])
+        first = len(self.precision) - sum(t.width for t in self.terms[i:])
         kept = np.ones(len(self.precision), bool)
-        kept[first : first + len(self.terms[i].deviation)] = False
+        kept[first : first + self.terms[i].width] = False
         normal = self.normal[0][np.ix_(kept, kept)], self.normal[1][kept]
         columns = OnDemand(lambda joint: self.columns[joint][:, kept], len(self.columns))
         others = (*self.terms[:i], *self.terms[i + 1 :])

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from ..arm import Arm
 from ..errors import InputError
 from ..parameters import random_regressor
+from .discrepancy import of_known
 from .traces import Trace
 
 Knowledge = Literal["exact", "identified", "rough", "unknown"]
@@ -26,8 +27,6 @@ Knowledge = Literal["exact", "identified", "rough", "unknown"]
 _SAMPLES = 1500
 """Samples, taken as independent, of the identification that "identified" supposes."""
 _FRICTION = {"exact": 0.0, "identified": 0.02, "rough": 0.2, "unknown": 10.0}
-_TURNED = 0.5
-"""Deviation of the share of known friction that turns over each of some speeds."""
 _SHAKEN = 0.5
 """Deviation of the share of an acceleration that is noise."""
 _UNKNOWN = 1e3
@@ -38,11 +37,6 @@ def check(knowledge: str) -> None:
     """Refuse a word that is none."""
     if knowledge not in get_args(Knowledge):
         raise InputError(f"unknown knowledge {knowledge!r}; there are {', '.join(get_args(Knowledge))}")
-
-
-def wider(knowledge: Knowledge) -> Knowledge | None:
-    """What recordings may widen a word to. `exact` is a promise; that nothing is known only the user can say."""
-    return "rough" if knowledge == "identified" else None
 
 
 def inertial_spread(
@@ -75,15 +69,18 @@ def _rough(arm: Arm) -> Float[np.ndarray, "standard n"]:
 
 
 def nuisance(
-    traces: Sequence[Trace], spread: Float[np.ndarray, "standard n"], knowledge: Knowledge
-) -> list[Float[np.ndarray, "_time dof _n"]]:
-    """The columns N of each recording; the last of them how known friction turns and noise of the
-    encoders, which no knowledge takes away."""
+    traces: Sequence[Trace],
+    spread: Float[np.ndarray, "standard n"],
+    knowledge: Knowledge,
+    std: Float[np.ndarray, " dof"],
+) -> tuple[list[Float[np.ndarray, "_time dof _n"]], int]:
+    """The columns N of each recording, and how many of them are numbers of the model; the others are what its
+    friction may be off and noise of the encoders, which no knowledge takes away. `std`: of the noise [N m]."""
     arm = traces[0].motion.arm
     share = _FRICTION[knowledge]
     damping, level = share * np.asarray(arm.damping), share * np.asarray(arm.frictionloss)
-    out = []
-    for trace in traces:
+    out, numbers = [], 0
+    for trace, off in zip(traces, of_known(traces, std), strict=True):
         parts = [trace.motion.regressor @ spread]
         joints = np.eye(arm.dof)
         for j in np.flatnonzero(damping > 0):
@@ -91,8 +88,9 @@ def nuisance(
         sign = trace.down(trace.sign)
         for j in np.flatnonzero(level > 0):
             parts.append((level[j] * sign)[:, :, None] * joints[:, j : j + 1])
-        out.append(np.concatenate([*parts, _TURNED * trace.turning, _SHAKEN * trace.shaken], 2))
-    return out
+        numbers = sum(p.shape[2] for p in parts)
+        out.append(np.concatenate([*parts, off, _SHAKEN * trace.shaken], 2))
+    return out, numbers
 
 
 def changes(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import operator
 import threading
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from ..arm import Arm
 from ..effects import AbstractEffect, AbstractJointEffect
 from ..errors import InputError
 from . import catchall
+from .discrepancy import of_law, unresolved
 from .evidence import Design, Noise, OnDemand
 from .host import parallel
 from .library import Candidates, build, columns_of
@@ -38,11 +40,40 @@ class Term:
     effect: AbstractEffect
     columns: tuple[Float[np.ndarray, "_time dof _n"], ...]
     deviation: Float[np.ndarray, " n"]
+    discrepancy: tuple[Float[np.ndarray, "_time dof _m"], ...] = ()
+    """What its law may be off, with coefficients of unit variance; none where empty."""
+    unresolved: Float[np.ndarray, "rows dof"] | None = None
+    """Square of what it may be off from sample to sample, which no column describes [N² m²]."""
+    prior: float = 0.0
+    """Logarithm of its prior odds, less what the search over its shapes has cost [nats]."""
+
+    @property
+    def law(self) -> "Term":
+        """The law alone, believed to the last digit."""
+        return dataclasses.replace(self, discrepancy=(), unresolved=None)
 
     @property
     def key(self) -> tuple[str, tuple[int, ...]]:
         """Name and joints: what makes two terms the same finding."""
         return self.effect.name, self.effect.joints
+
+    @functools.cached_property
+    def precision(self) -> Float[np.ndarray, " width"]:
+        """Prior precision of all its coefficients in a design: the law's, then the discrepancy's."""
+        more = self.discrepancy[0].shape[2] if self.discrepancy else 0
+        return np.concatenate([self.deviation**-2.0, np.ones(more)])
+
+    @property
+    def width(self) -> int:
+        """How many coefficients it has in a design."""
+        return len(self.precision)
+
+    def at_joint(self, joint: int) -> list[Float[np.ndarray, "_time width"]]:
+        """Columns of a joint in each recording, the discrepancy's last."""
+        law = [c[:, joint] for c in self.columns]
+        if not self.discrepancy:
+            return law
+        return [np.concatenate([a, d[:, joint]], 1) for a, d in zip(law, self.discrepancy, strict=True)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +86,8 @@ class Problem:
     nuisance: tuple[Float[np.ndarray, "_time dof _n"], ...]
     background: tuple[Term, ...] = ()
     """Effects that are known already: their columns are in the nuisance, and count as signal in the noise."""
+    numbers: int | None = None
+    """How many columns of the nuisance, the first ones, are numbers of the user's model."""
     saturated: Saturation | None = dataclasses.field(default=None, repr=False, compare=False)
     """That of the same recordings, where a problem posed otherwise has made it already."""
     _lock: threading.Lock = dataclasses.field(
@@ -105,20 +138,37 @@ class Problem:
         return slice(stop - self.traces[0].shaken.shape[2], stop)
 
     @property
-    def turning(self) -> slice:
-        """Where the nuisance has how known friction turns."""
+    def known_off(self) -> slice:
+        """Where the nuisance has what the known friction may be off."""
         stop = self.shaken.start
-        return slice(stop - self.traces[0].turning.shape[2], stop)
+        return slice(stop if self.numbers is None else self.numbers, stop)
 
-    def explained(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """The coefficients less those of the encoders' noise, which belongs to a recording and to no model."""
-        x = x.copy()
-        x[self.shaken] = 0.0
-        return x
+    def explained(self, x: Float[np.ndarray, " n"], terms: Sequence[Term] = ()) -> Float[np.ndarray, " n"]:
+        """Of a design's coefficients those of the nuisance and of the terms' laws, what belongs to a recording and
+        to no model set to zero: the encoders' noise, and what laws are off."""
+        count = self.nuisance[0].shape[2]
+        nuisance = x[:count].copy()
+        nuisance[self.shaken], nuisance[self.known_off] = 0.0, 0.0
+        ends = count + np.cumsum([0, *(t.width for t in terms)])
+        laws = [x[at : at + len(t.deviation)] for at, t in zip(ends, terms, strict=False)]
+        return np.concatenate([nuisance, *laws])
 
-    def term(self, effect: AbstractEffect, deviation: Float[np.ndarray, " n"]) -> Term:
-        """The effect's columns in all recordings."""
-        return Term(effect, tuple(self.full_columns(effect)), deviation)
+    def term(
+        self,
+        effect: AbstractEffect,
+        deviation: Float[np.ndarray, " n"],
+        c: Float[np.ndarray, " n"] | None = None,
+        std: Float[np.ndarray, " dof"] | None = None,
+        prior: float = 0.0,
+    ) -> Term:
+        """The effect's columns in all recordings; with its discrepancy, where coefficients and noise are known."""
+        columns = tuple(self.full_columns(effect))
+        if c is None or std is None:
+            return Term(effect, columns, deviation, prior=prior)
+        torque = [x @ c for x in columns]
+        evaluate = lambda other: [x @ c for x in self.full_columns(other)]
+        off = tuple(of_law(self.traces, effect, torque, std, evaluate))
+        return Term(effect, columns, deviation, off, unresolved(self.traces, torque), prior)
 
     def full_columns(self, effect: AbstractEffect) -> list[Float[np.ndarray, "_time dof _n"]]:
         """Columns of an effect, at all joints."""
@@ -179,10 +229,20 @@ class Problem:
     def whitened(self, columns: Sequence[np.ndarray], noise: Noise, joint: int) -> np.ndarray:
         """Rows of a joint in all recordings, one below the other, with unit noise."""
         parts = []
-        for trace, x in zip(self.traces, columns, strict=True):
-            w = trace.weights[:, joint].reshape(-1, *[1] * (x.ndim - 1))
+        for r, x in enumerate(columns):
+            w = self.weights(noise, r, joint).reshape(-1, *[1] * (x.ndim - 1))
             parts.append(noise.whiten(x, joint) * w)
         return np.concatenate(parts)
+
+    def weights(self, noise: Noise, r: int, joint: int) -> Float[np.ndarray, " _time"]:
+        """What the samples of a recording weigh in a joint."""
+        return self.traces[r].weights[:, joint] * noise.trusted(self.rows[r], joint)
+
+    @functools.cached_property
+    def rows(self) -> list[slice]:
+        """Where each recording's samples are, all one below the other."""
+        ends = np.cumsum([0, *(t.motion.samples for t in self.traces)]).tolist()
+        return [slice(a, b) for a, b in itertools.pairwise(ends)]
 
     @functools.cached_property
     def families(self) -> list[Family]:
@@ -210,7 +270,8 @@ class Problem:
 
     def whitened_joint(self, noise: Noise, joint: int, terms: Sequence[Term] = ()) -> Whitened:
         """Residual, nuisance and terms in a joint, whitened; kept while the joint's noise stays."""
-        stamp = noise.a[joint].tobytes(), float(noise.sigma[joint])
+        trust = None if noise.trust is None else noise.trust[:, joint].tobytes()
+        stamp = noise.a[joint].tobytes(), float(noise.sigma[joint]), trust
         here = self._joints.get(joint)
         if here is None or here.stamp != stamp:
             residual = self.whitened([r[:, joint] for r in self.residual], noise, joint)
@@ -218,9 +279,9 @@ class Problem:
             here = self._joints[joint] = Whitened(stamp, residual, nuisance)
         for term in terms:
             if id(term) not in here.terms:
-                columns = [c[:, joint] for c in term.columns]
-                acts = any(np.any(c) for c in columns)
-                here.terms[id(term)] = term, self.whitened(columns, noise, joint) if acts else None
+                acts = any(np.any(c[:, joint]) for c in term.columns)
+                rows = self.whitened(term.at_joint(joint), noise, joint) if acts else None
+                here.terms[id(term)] = term, rows
         return here
 
     def whitened_joints(self, noise: Noise, terms: Sequence[Term]) -> list[Whitened]:
@@ -251,7 +312,7 @@ class Problem:
 
     def design(self, terms: Sequence[Term], noise: Noise) -> Design:
         """The model with these terms, whitened."""
-        counts = [self.nuisance[0].shape[2], *(len(t.deviation) for t in terms)]
+        counts = [self.nuisance[0].shape[2], *(t.width for t in terms)]
         ends = np.cumsum([0, *counts])
         place = {
             key: slice(ends[i], ends[i + 1]) for i, key in enumerate(["nuisance", *(id(t) for t in terms)])
@@ -265,7 +326,7 @@ class Problem:
                 for right in acting[: i + 1]:
                     H[place[left], place[right]] += here.product(left, right)
         H = np.tril(H) + np.tril(H, -1).T
-        precision = np.concatenate([np.ones(counts[0]), *(t.deviation**-2.0 for t in terms)])
+        precision = np.concatenate([np.ones(counts[0]), *(t.precision for t in terms)])
         parts = [[(at, x) for key, at in place.items() if (x := h.rows(key)) is not None] for h in joints]
 
         def joined(joint: int) -> Float[np.ndarray, "rows n"]:
@@ -323,7 +384,7 @@ class Problem:
         columns = np.concatenate([np.concatenate(part, 2) for part in parts])
         corrected = users = 0.0
         for (_, test), x in zip(folds, _left_out(design, folds), strict=True):
-            left = residual[test] - columns[test] @ self.explained(x)
+            left = residual[test] - columns[test] @ self.explained(x, design.terms)
             corrected += float(np.sum((weight[test] * left) ** 2))
             users += float(np.sum((weight[test] * residual[test]) ** 2))
         return corrected, users
@@ -367,7 +428,9 @@ class Problem:
                 " physics from noise; record longer: of seven joints 2 s at 100 Hz or more are enough"
             )
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
-        return Noise(np.stack(a), np.array(sigma), np.array(std))
+        off = [t.unresolved for t in terms if t.unresolved is not None]
+        trust = 1 / np.sqrt(1 + np.sum(off, 0) / np.square(std)) if off else None
+        return Noise(np.stack(a), np.array(sigma), np.array(std), trust)
 
 
 def _left_out(
@@ -400,6 +463,7 @@ def posed(
     nuisance: Sequence[Float[np.ndarray, "_time dof _n"]],
     background: Sequence[Term] = (),
     saturated: Saturation | None = None,
+    numbers: int | None = None,
 ) -> Problem:
     """A problem whose background acts in all recordings: its columns, by their deviations, end the nuisance."""
     everywhere = Problem(traces, (True,) * len(traces), tuple(nuisance))
@@ -407,4 +471,4 @@ def posed(
     wide = [
         np.concatenate([n, *(t.columns[r] * t.deviation for t in terms)], 2) for r, n in enumerate(nuisance)
     ]
-    return Problem(traces, active, tuple(wide), terms, saturated)
+    return Problem(traces, active, tuple(wide), terms, numbers, saturated)

@@ -37,7 +37,7 @@ def whitened_slices(
     start = 0
     for trace in traces:
         stop = start + trace.motion.samples
-        weight = trace.weights[:, joint] / noise.sigma[joint]
+        weight = trace.weights[:, joint] * noise.trusted(slice(start, stop), joint) / noise.sigma[joint]
         for low in range(start + order, stop, step):
             high = min(low + step, stop)
             y = a[0] * x[low - 1 : high - 1]
@@ -117,7 +117,7 @@ class Block:
         place = len(here.nuisance.T)
         A[:place] = kept["nuisance"]
         for term in design.terms:
-            width = len(term.deviation)
+            width = term.width
             if id(term) in acting:
                 A[place : place + width] = kept[id(term)]
             place += width

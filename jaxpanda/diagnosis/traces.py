@@ -35,8 +35,6 @@ _GAP, _NEAR = 3.5, 0.12
 _TURN = 0.01
 """How long before or after a joint turns its known friction may [s]: MuJoCo's constraint does so before the
 velocity changes sign, the friction of a gear after it, and a filtered velocity shows neither."""
-_TURNS = (0.003, 0.01, 0.03)
-"""Speeds over which a gear's friction may turn [rad/s]."""
 _SHAKEN = (2.5, 5.0)
 """Where the bands begin in which noise of q, differentiated twice, may outweigh the motion [Hz]."""
 _SHARPER, _SHARP = 2.5, 6.0
@@ -110,19 +108,6 @@ class Trace:
         below = [signals_.zero_phase(qdd, cutoff, rate) for cutoff in _SHAKEN if cutoff < 0.45 * rate]
         bands = [high - low for low, high in itertools.pairwise([*below, qdd])]
         return np.concatenate([self.motion.mass * band[:, None] for band in bands], 2)
-
-    @functools.cached_property
-    def turning(self) -> Float[np.ndarray, "time dof n"]:
-        r"""What known friction is off while it turns [N m], if it does so as $\tanh(\dot q_j/v)$, v of `_TURNS`,
-        and not as MuJoCo's constraint: no gear's does just that."""
-        loss = np.asarray(self.motion.arm.frictionloss)
-        joints, rubs = np.eye(len(loss)), np.flatnonzero(loss > 0)
-        off = [
-            self.down(loss * (np.tanh(self.channels.qd / v) - self.sign))[:, :, None] * joints[:, j : j + 1]
-            for v in _TURNS
-            for j in rubs
-        ]
-        return np.concatenate([np.zeros((*self.motion.q.shape, 0)), *off], 2)
 
     def down(self, fine: Float[np.ndarray, "fine ..."]) -> Float[np.ndarray, "time ..."]:
         """From the fine grid to the coarse one, filtered like the torque."""

@@ -100,10 +100,15 @@ def _moved(problem: Problem, state: State, near: Linearised, step: Float[np.ndar
         most = first_steps(state.terms[i].effect)[k]
         steps[i][k] = np.clip(value, -most, most)
     terms = [
-        problem.term(within(problem, moved(t.effect, steps[i])), t.deviation) if i in steps else t
+        _reshaped(problem, t, within(problem, moved(t.effect, steps[i]))) if i in steps else t
         for i, t in enumerate(state.terms)
     ]
     return State(tuple(terms), state.noise, problem.design(terms, state.noise))
+
+
+def _reshaped(problem: Problem, term: Term, effect: AbstractEffect) -> Term:
+    """The term with another shape, of nearly the same torque."""
+    return dataclasses.replace(term, effect=effect, columns=tuple(problem.full_columns(effect)))
 
 
 def covariances(problem: Problem, state: State) -> list[Float[np.ndarray, "n n"]]:

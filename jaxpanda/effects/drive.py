@@ -29,14 +29,16 @@ class Armature(AbstractInstantEffect):
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "joint_spring")
 
     joint: Joint
+    form: str = eqx.field(static=True, default="")
+    """"signed" where the model has some already: there may be less of it."""
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["Armature"]:
-        return [cls(j) for j in range(arm.dof)]
+        return [cls(j, "signed" if arm.armature[j] > 0 else "") for j in range(arm.dof)]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("armature", "kg·m²", sign=1),)
+        return (Coefficient("armature", "kg·m²", sign=0 if self.form else 1),)
 
     @property
     def equation(self) -> str:
@@ -67,6 +69,7 @@ class JointSpring(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "joint_spring"
+    prior: ClassVar[float] = -28.0
     reveals: ClassVar[str] = "the joint's full range at rest, in different poses of the arm"
     confounded_with: ClassVar[tuple[str, ...]] = ("torque_offset", "inertial_parameters", "encoder_offset")
 
@@ -214,6 +217,9 @@ class JointElasticity(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "joint_elasticity"
+    prior: ClassVar[float] = -40.0
+    discrepancy: ClassVar[float] = 0.15
+    varies_with: ClassVar[tuple[str, ...]] = ("moments",)
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
     shapes: ClassVar[tuple[Shape, ...]] = (
         Shape("stiffness", "N·m/rad", 50.0, 1e6, pivot=True),
@@ -329,6 +335,9 @@ class Backlash(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "backlash"
+    prior: ClassVar[float] = -31.0
+    discrepancy: ClassVar[float] = 0.3
+    varies_with: ClassVar[tuple[str, ...]] = ("moments",)
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
     shapes: ClassVar[tuple[Shape, ...]] = (
         Shape("half_width", "rad", 2e-4, 0.1, pivot=True),

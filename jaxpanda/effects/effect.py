@@ -78,6 +78,13 @@ class AbstractEffect(eqx.Module):
     reveals: ClassVar[str] = ""
     """The motion that shows the effect, and tells it from what it is confounded with."""
     confounded_with: ClassVar[tuple[str, ...]] = ()
+    prior: ClassVar[float] = -25.0
+    """Logarithm of the odds, beforehand, that it is somewhere where it is not in the model."""
+    discrepancy: ClassVar[float] = 0.02
+    """Share by which the torque of such physics differs from the law of this class, as a standard deviation."""
+    varies_with: ClassVar[tuple[str, ...]] = ("q", "qd", "t")
+    """What that share varies with: the joint's position, its velocity, the clock; "moments" is a clock of short
+    periods, for what comes and goes."""
     repeats: ClassVar[bool] = False
     """Whether it can act several times over at one place."""
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "plant"
@@ -110,6 +117,26 @@ class AbstractEffect(eqx.Module):
     @abc.abstractmethod
     def equation(self) -> str:
         """Readable equation in the symbols of the parameters."""
+
+    @property
+    def held(self) -> tuple[type["AbstractEffect"], ...]:
+        """Effects whose laws this form holds besides its own: it is a sum of parts, and pays for each."""
+        return ()
+
+    @property
+    def may_hold(self) -> frozenset[str]:
+        """Names of the effects that some form of it holds."""
+        return frozenset()
+
+    @property
+    def form_prior(self) -> float:
+        """What the form adds to `prior`."""
+        return sum(part.prior for part in self.held)
+
+    @property
+    def title(self) -> str:
+        """Name of what it is: a law whose shape is that of another is called so."""
+        return self.name
 
     def variants(self, arm: Arm) -> Sequence["AbstractEffect"]:
         """Other forms of the same shape that a refinement should try."""
@@ -400,3 +427,25 @@ def sign_over_velocity(qd: Array, width: Array | float) -> Array:
     near = jnp.abs(x) < 1e-3
     away = jnp.where(near, 1.0, x)
     return jnp.where(near, 1 - x**2 / 3, jnp.tanh(away) / away) / width
+
+
+_NEIGHBOUR = 0.5, 0.1, 0.05
+"""How far a neighbouring shape is: of a logarithm, as a share of the bounds, of an instant [s]."""
+
+
+def neighbours(effect: AbstractEffect) -> list[AbstractEffect]:
+    """The effect with one number of its shape larger or smaller, within its bounds."""
+    out = []
+    for shape in effect.shapes:
+        value, wide = float(getattr(effect, shape.name)), shape.upper - shape.lower
+        for side in (-1.0, 1.0):
+            log, share, instant = (side * x for x in _NEIGHBOUR)
+            moved = (
+                value * np.exp(log)
+                if shape.logarithmic
+                else value + (share * wide if np.isfinite(wide) else instant)
+            )
+            inside = float(np.clip(moved, shape.lower, shape.upper))
+            if inside != value and not shape.pivot:
+                out.append(dataclasses.replace(effect, **{shape.name: inside}))
+    return out

@@ -6,11 +6,13 @@ from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm import Arm
 from .effect import (
     AbstractDryFriction,
+    AbstractEffect,
     AbstractInstantEffect,
     Coefficient,
     Numbers,
@@ -23,6 +25,8 @@ from .motion import Channels, Joint
 _WIDTH = Shape("v0", "rad/s", 1e-3, 0.3)
 
 
+COMMON = -15.0
+"""Prior of friction that every gear has."""
 PROPORTIONAL = 1.25
 """Exponent of the speed, or one over it, up to which friction is called proportional to it."""
 
@@ -36,17 +40,20 @@ class ViscousFriction(AbstractInstantEffect):
 
     name: ClassVar[str] = "viscous_friction"
     reveals: ClassVar[str] = "runs at four or more constant speeds, in both directions"
+    prior: ClassVar[float] = COMMON
     confounded_with: ClassVar[tuple[str, ...]] = ("coulomb_friction", "time_delay")
 
     joint: Joint
+    form: str = eqx.field(static=True, default="")
+    """"signed" where the model has some already: there may be less of it."""
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["ViscousFriction"]:
-        return [cls(j) for j in range(arm.dof)]
+        return [cls(j, "signed" if arm.damping[j] > 0 else "") for j in range(arm.dof)]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("damping", "N·m·s/rad", sign=1),)
+        return (Coefficient("damping", "N·m·s/rad", sign=0 if self.form else 1),)
 
     @property
     def equation(self) -> str:
@@ -65,6 +72,7 @@ class CoulombFriction(AbstractDryFriction):
     name: ClassVar[str] = "coulomb_friction"
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
     reveals: ClassVar[str] = "reversals, with dwells between them"
+    prior: ClassVar[float] = COMMON
     confounded_with: ClassVar[tuple[str, ...]] = (
         "presliding_hysteresis",
         "stribeck_friction",
@@ -73,14 +81,17 @@ class CoulombFriction(AbstractDryFriction):
 
     joint: Joint
     v0: Float[Array, ""] | float
+    form: str = eqx.field(static=True, default="")
+    """"signed" where the model has some already: there may be less of it."""
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["CoulombFriction"]:
-        return [cls(j, v0) for v0 in (0.003, 0.01, 0.03, 0.1) for j in range(arm.dof)]
+        form = ["signed" if level > 0 else "" for level in np.asarray(arm.frictionloss)]
+        return [cls(j, v0, form[j]) for v0 in (0.003, 0.01, 0.03, 0.1) for j in range(arm.dof)]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("coulomb", "N·m", sign=1),)
+        return (Coefficient("coulomb", "N·m", sign=0 if self.form else 1),)
 
     @property
     def equation(self) -> str:
@@ -106,6 +117,7 @@ class PowerLawFriction(AbstractDryFriction):
     name: ClassVar[str] = "power_law_friction"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("exponent", "1", 0.35, 3.0),)
     reveals: ClassVar[str] = ViscousFriction.reveals
+    prior: ClassVar[float] = -28.0
     confounded_with: ClassVar[tuple[str, ...]] = ("viscous_friction", "coulomb_friction", "stribeck_friction")
 
     joint: Joint
@@ -117,9 +129,9 @@ class PowerLawFriction(AbstractDryFriction):
         return [cls(joint=j, exponent=p) for p in (0.5, 0.7, 1.5, 2.0, 2.5) for j in range(arm.dof)]
 
     @property
-    def is_viscous(self) -> bool:
-        """Whether it is all but proportional to the speed."""
-        return 1 / PROPORTIONAL < float(self.exponent) < PROPORTIONAL
+    def title(self) -> str:
+        proportional = 1 / PROPORTIONAL < float(self.exponent) < PROPORTIONAL
+        return ViscousFriction.name if proportional else self.name
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -148,6 +160,7 @@ class AsymmetricFriction(AbstractDryFriction):
     name: ClassVar[str] = "asymmetric_friction"
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
     reveals: ClassVar[str] = "rests of 0.3 s and more, and motion in both directions"
+    prior: ClassVar[float] = -28.0
     confounded_with: ClassVar[tuple[str, ...]] = ("torque_offset", "coulomb_friction")
 
     joint: Joint
@@ -159,6 +172,19 @@ class AsymmetricFriction(AbstractDryFriction):
         forms = [("whole", 0.005), ("whole", 0.03), ("extra", 0.005), ("extra", 0.03)]
         forms += [("viscous", 0.01), ("viscous extra", 0.01), ("both", 0.005), ("both", 0.03)]
         return [cls(j, v0, form) for form, v0 in forms for j in range(arm.dof)]
+
+    @property
+    def may_hold(self) -> frozenset[str]:
+        return frozenset({CoulombFriction.name})
+
+    @property
+    def held(self) -> tuple[type[AbstractEffect], ...]:
+        return {
+            "whole": (CoulombFriction,),
+            "viscous": (ViscousFriction,),
+            "both": (CoulombFriction,),
+            "full": (CoulombFriction, ViscousFriction),
+        }.get(self.form, ())
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -237,6 +263,7 @@ class StribeckFriction(AbstractDryFriction):
         Shape("v0", "rad/s", 1e-3, 0.05),
     )
     reveals: ClassVar[str] = "slow ramps through zero velocity, in several poses"
+    prior: ClassVar[float] = -28.0
     confounded_with: ClassVar[tuple[str, ...]] = (
         "coulomb_friction",
         "presliding_hysteresis",
@@ -259,6 +286,14 @@ class StribeckFriction(AbstractDryFriction):
             for v0 in ((0.004, 0.02) if vs > 0.03 else (0.004,))
             for j in range(arm.dof)
         ]
+
+    @property
+    def may_hold(self) -> frozenset[str]:
+        return frozenset({CoulombFriction.name})
+
+    @property
+    def held(self) -> tuple[type[AbstractEffect], ...]:
+        return {"whole": (CoulombFriction,), "viscous": (CoulombFriction, ViscousFriction)}.get(self.form, ())
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -302,6 +337,7 @@ class LoadDependentFriction(AbstractDryFriction):
     name: ClassVar[str] = "load_dependent_friction"
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH, Shape("exponent", "1", 0.6, 1.6))
     reveals: ClassVar[str] = "the same speed in loaded and unloaded poses; with and without payload"
+    prior: ClassVar[float] = -28.0
     confounded_with: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_gain", "friction_drift")
 
     joint: Joint
@@ -317,6 +353,14 @@ class LoadDependentFriction(AbstractDryFriction):
             for v0 in (0.004, 0.02, 0.06)
             for j in range(arm.dof)
         ]
+
+    @property
+    def may_hold(self) -> frozenset[str]:
+        return frozenset({CoulombFriction.name})
+
+    @property
+    def held(self) -> tuple[type[AbstractEffect], ...]:
+        return (CoulombFriction,) if "coulomb" in self.form.split() else ()
 
     def variants(self, arm: Arm) -> Sequence["LoadDependentFriction"]:
         forms = ("directed", "coulomb directed", "viscous", "directed viscous")
@@ -380,6 +424,7 @@ class FrictionDrift(AbstractDryFriction):
     name: ClassVar[str] = "friction_drift"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0), _WIDTH)
     reveals: ClassVar[str] = "the same motion cold and warm"
+    prior: ClassVar[float] = -28.0
     confounded_with: ClassVar[tuple[str, ...]] = (
         "coulomb_friction",
         "load_dependent_friction",
@@ -411,6 +456,14 @@ class FrictionDrift(AbstractDryFriction):
         return {"level": (level,), "slope": (slope,), "both": (level, slope)}[
             self.form.removesuffix(" extra")
         ]
+
+    @property
+    def may_hold(self) -> frozenset[str]:
+        return frozenset({CoulombFriction.name})
+
+    @property
+    def held(self) -> tuple[type[AbstractEffect], ...]:
+        return () if self.form.endswith("extra") else tuple(type(law) for law in self.steady)
 
     def variants(self, arm: Arm) -> Sequence["FrictionDrift"]:
         return [dataclasses.replace(self, form=form) for form in ("both", "both extra") if form != self.form]

@@ -180,6 +180,11 @@ class PayloadChange(AbstractArmEffect):
     form: str = eqx.field(static=True)
 
     @property
+    def form_prior(self) -> float:
+        """Any push may look like a body held for a while."""
+        return -12.0 if self.form == "carried" else 0.0
+
+    @property
     def shapes(self) -> tuple[Shape, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         names = {"gained": ("start",), "lost": ("stop",), "carried": ("start", "stop")}[self.form]
         return tuple(Shape(name, "s", -np.inf, np.inf, False) for name in names)

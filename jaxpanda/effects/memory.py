@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ..arm import Arm
 from .effect import (
+    AbstractEffect,
     AbstractMemoryEffect,
     Coefficient,
     Numbers,
@@ -18,6 +19,7 @@ from .effect import (
     sign_over_velocity,
     smooth_sign,
 )
+from .friction import CoulombFriction
 from .motion import Channels, Joint
 
 STICKS = 1.5e-3
@@ -82,6 +84,15 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         return f"tau = {torque}, {law}"
 
     @property
+    def held(self) -> tuple[type[AbstractEffect], ...]:
+        return (CoulombFriction,) if self._extent == "whole" else ()
+
+    @property
+    def title(self) -> str:
+        """Of a joint whose model has the level already, memory is all that it adds."""
+        return CoulombFriction.name if self.sticks and self._extent != "extra" else self.name
+
+    @property
     def sticks(self) -> bool:
         """Whether it is Coulomb's friction, which holds a joint at rest."""
         return float(self.breakaway_distance) < STICKS
@@ -135,6 +146,18 @@ class PreslidingHysteresis(AbstractMemoryEffect):
 
 _WIDTH = 0.005
 """Velocity over which the sign changes that takes off, or adds, a Coulomb level [rad/s]."""
+
+
+_SPEEDS = (0.003, 0.01, 0.03)
+_DISTANCES = (5e-4, 2e-3, 6e-3)
+
+
+def turns(joint: int) -> tuple[AbstractMemoryEffect | CoulombFriction, ...]:
+    """Ways in which the dry friction of a joint may turn: over some speeds [rad/s], over some distances [rad]."""
+    return (
+        *(CoulombFriction(joint, v) for v in _SPEEDS),
+        *(PreslidingHysteresis(joint, x, "dahl only") for x in _DISTANCES),
+    )
 
 
 EFFECTS = (PreslidingHysteresis,)

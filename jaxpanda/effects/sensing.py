@@ -98,6 +98,7 @@ class TorqueDrift(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "torque_drift"
+    prior: ClassVar[float] = -28.0
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0),)
     reveals: ClassVar[str] = "the same poses early and late"
     confounded_with: ClassVar[tuple[str, ...]] = ("payload_change", "friction_drift", "torque_offset")
@@ -263,6 +264,7 @@ class TimeDelay(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "time_delay"
+    prior: ClassVar[float] = -45.0
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "s", 1e-4, 0.2, pivot=True),)
     reveals: ClassVar[str] = "fast reversals"
     confounded_with: ClassVar[tuple[str, ...]] = (

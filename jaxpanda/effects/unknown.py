@@ -20,6 +20,8 @@ from .effect import (
 )
 from .motion import Channels, Joint
 
+FREE = -35.0
+"""Prior of a torque that has no law."""
 SIGN_WIDTH = 0.01
 """Velocity over which friction without a law changes sign [rad/s]."""
 FORMS = {
@@ -44,6 +46,7 @@ class Unknown(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "unknown"
+    prior: ClassVar[float] = FREE
     repeats: ClassVar[bool] = True
     reveals: ClassVar[str] = "single-joint motions that vary the channel it depends on and nothing else"
 
@@ -140,6 +143,7 @@ class UnknownOfTwo(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "unknown"
+    prior: ClassVar[float] = FREE
     repeats: ClassVar[bool] = True
     reveals: ClassVar[str] = Unknown.reveals
 
@@ -181,6 +185,7 @@ class UnknownAt(AbstractDryFriction):
     """
 
     name: ClassVar[str] = "unknown"
+    prior: ClassVar[float] = FREE
     repeats: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (
         Shape("place", "rad", -np.inf, np.inf, logarithmic=False),

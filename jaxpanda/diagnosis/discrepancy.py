@@ -1,0 +1,144 @@
+r"""What a law may be off: no gear's friction, spring or sensor is quite the one in a textbook.
+
+$$\tau = B c + D \epsilon, \qquad \epsilon \sim N(0, 1)$$
+
+with a few columns D that are made from the law's own torque: copies of it that vary smoothly with what such laws
+depend on, each of the size `discrepancy` of the effect's class; what neighbouring shapes of the law would give; and,
+for dry friction, other ways to turn at a reversal: over other speeds, or over a distance, as a gear's bristles do.
+A law without them is believed to the last digit, and what it leaves is taken for a second effect.
+
+References:
+    Kennedy and O'Hagan, J. R. Stat. Soc. B 2001; Brynjarsdóttir and O'Hagan, Inverse Problems 2014.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ..effects import AbstractEffect, AbstractJointEffect, neighbours, turns
+from ..effects.friction import CoulombFriction
+from .library import columns_of
+from .noise import hats
+from .traces import Trace
+
+SEEN = 0.1
+"""Discrepancy over the noise's deviation below which it is left out: it would change nothing."""
+SHAPE = 0.3
+"""Deviation of a neighbouring shape's share."""
+import os
+TURN = float(os.environ.get("TURN","0.3"))
+"""Deviation of the share of dry friction that turns in another way."""
+import os
+UNRESOLVED, TIMING = float(os.environ.get("UNR", "0.01")), float(os.environ.get("TIM", "0.002"))
+"""Share of its torque by which a law is off in no smooth way, and by how much it may be early or late [s]."""
+_KNOTS = {"q": 5, "qd": 6, "t": 4}
+_PERIOD = 1.5
+"""Between knots in time of what comes and goes [s]."""
+
+Torque = list[Float[np.ndarray, "_time dof"]]
+"""In each recording [N m]."""
+
+
+def of_law(
+    traces: Sequence[Trace],
+    effect: AbstractEffect,
+    torque: Torque,
+    std: Float[np.ndarray, " dof"],
+    evaluate: Callable[[AbstractEffect], Torque],
+) -> list[Float[np.ndarray, "_time dof _m"]]:
+    """Columns of a law's discrepancy in each recording, of unit variance.
+
+    Args:
+        traces: the recordings.
+        effect: the law.
+        torque: what it explains.
+        std: deviation of each joint's noise [N m].
+        evaluate: torque of another shape, with the coefficients of this one.
+    """
+    ends = np.cumsum([t.motion.samples for t in traces])[:-1]
+    stacked, dof = np.concatenate(torque), torque[0].shape[1]
+    weights = np.concatenate([t.weights for t in traces])
+    count = np.maximum((weights**2).sum(0), 1.0)
+    size = lambda x: np.sqrt(((weights * x) ** 2).sum(0) / count) / std
+    columns: list[np.ndarray] = []
+
+    def take(joint: int, values: Float[np.ndarray, "rows n"]) -> None:
+        wide = np.zeros((len(values), dof, values.shape[1]))
+        wide[:, joint] = values
+        columns.append(wide)
+
+    for j in np.flatnonzero(effect.discrepancy * size(stacked) > SEEN):
+        for channel in effect.varies_with:
+            copies = effect.discrepancy * stacked[:, j, None] * _hats(traces, int(j), channel)
+            take(int(j), copies)
+    if np.any(size(stacked) > SEEN):
+        for other in neighbours(effect):
+            off = SHAPE * (np.concatenate(evaluate(other)) - stacked)
+            if np.any(size(off) > SEEN):
+                columns.append(off[:, :, None])
+    if effect.dry_width is not None and isinstance(effect, AbstractJointEffect):
+        j = effect.joints[0]
+        moving = np.abs(stacked[:, j]) > 0.1 * np.abs(stacked[:, j]).max()
+        level = float(np.sqrt(np.mean(stacked[moving, j] ** 2))) if moving.any() else 0.0
+        if TURN * level > SEEN * std[j]:
+            reference = np.concatenate(
+                [t.down(np.tanh(t.channels.qd[:, j] / float(effect.dry_width))) for t in traces]
+            )
+            take(j, TURN * level * (turning(traces, j) - reference[:, None]))
+    if not columns:
+        return []
+    return np.split(np.concatenate(columns, 2), ends)
+
+
+def unresolved(traces: Sequence[Trace], torque: Torque) -> Float[np.ndarray, "rows dof"]:
+    """Square of what a law may be off from sample to sample [N² m²]: in proportion to its torque, and to how fast
+    that changes."""
+    rates = [np.gradient(tau, t.motion.dt, axis=0) for t, tau in zip(traces, torque, strict=True)]
+    return np.square(UNRESOLVED * np.concatenate(torque)) + np.square(TIMING * np.concatenate(rates))
+
+
+def turning(traces: Sequence[Trace], joint: int) -> Float[np.ndarray, "rows n"]:
+    """Signs of a joint's velocity that turn over several speeds and distances, low-passed like the torque."""
+    kinds = sorted({type(e) for e in turns(joint)}, key=lambda kind: kind.__name__)
+    alike = [[e for e in turns(joint) if type(e) is kind] for kind in kinds]
+    return np.concatenate(
+        [np.concatenate([columns_of(same, t)[:, :, 0] for same in alike], 1) for t in traces]
+    )
+
+
+def of_known(
+    traces: Sequence[Trace], std: Float[np.ndarray, " dof"]
+) -> list[Float[np.ndarray, "_time dof _m"]]:
+    """The same of the friction that the user's model holds, which is a law like any other."""
+    arm, dof = traces[0].motion.arm, traces[0].motion.dof
+    samples = [t.motion.samples for t in traces]
+    parts = [np.zeros((sum(samples), dof, 0))]
+    for j, level in enumerate(np.asarray(arm.frictionloss)):
+        if TURN * level > SEEN * std[j]:
+            sign = np.concatenate([t.down(t.sign[:, j]) for t in traces])
+            law = CoulombFriction
+            off = [TURN * level * (turning(traces, j) - sign[:, None])]
+            if law.discrepancy * level > SEEN * std[j]:
+                copies = (_hats(traces, j, channel) for channel in law.varies_with)
+                off += [law.discrepancy * level * sign[:, None] * copy for copy in copies]
+            values = np.concatenate(off, 1)
+            parts.append(values[:, None] * np.eye(dof)[j][:, None])
+    return np.split(np.concatenate(parts, 2), np.cumsum(samples)[:-1])
+
+
+def _hats(traces: Sequence[Trace], joint: int, channel: str) -> Float[np.ndarray, "rows n"]:
+    if channel == "moments":
+        parts = [hats(t.motion.time, max(3, round(np.ptp(t.motion.time) / _PERIOD))) for t in traces]
+        wide = np.zeros((sum(map(len, parts)), sum(p.shape[1] for p in parts)))
+        row = column = 0
+        for p in parts:
+            wide[row : row + len(p), column : column + p.shape[1]] = p
+            row, column = row + len(p), column + p.shape[1]
+        return wide
+    x = {
+        "q": lambda t: t.motion.q[:, joint],
+        "qd": lambda t: t.motion.qd[:, joint],
+        "t": lambda t: t.motion.time,
+    }
+    return hats(np.concatenate([x[channel](t) for t in traces]), _KNOTS[channel])
