@@ -1,8 +1,8 @@
 """Five arms written by hand from published kinematics, and their MJCF.
 
-Kinematics: Franka's modified Denavit-Hartenberg table; Universal Robots' and KUKA's published standard tables; the
-fifth is a small industrial arm of our own. Masses and centres of mass are the published or plausible ones; inertia is
-that of a thick rod along the link. Every case varies them a little.
+Kinematics: Franka's modified Denavit-Hartenberg table; Universal Robots' and KUKA's published standard
+tables; the fifth is a small industrial arm of our own. Masses and centres of mass are the published or plausible
+ones; inertia is that of a thick rod along the link. Every case varies them a little.
 """
 
 from dataclasses import dataclass, field, replace
@@ -367,16 +367,18 @@ def rigid(arm: Arm) -> mujoco.MjModel:
     return model
 
 
-def inverse(arm: Arm, q, qd, qdd, model=None) -> np.ndarray:
-    """Torque of the arm's file for every row: MuJoCo's inverse dynamics, its damping and its frictionloss.
+def dry(arm: Arm, qd) -> np.ndarray:
+    """Dry friction of the arm's file: the sign of the velocity, smoothed over 0.01 rad/s."""
+    return arm.of("frictionloss") * np.tanh(qd / 0.01)
 
-    Dry friction follows the sign of the velocity, smoothed over 0.01 rad/s.
-    """
-    model = rigid(arm) if model is None else model
+
+def inverse(arm: Arm, q, qd, qdd) -> np.ndarray:
+    """Torque of the arm's file for every row: MuJoCo's inverse dynamics, its damping and its frictionloss."""
+    model = rigid(arm)
     data = mujoco.MjData(model)
     tau = np.empty_like(q)
     for k in range(len(q)):
         data.qpos, data.qvel, data.qacc = q[k], qd[k], qdd[k]
         mujoco.mj_inverse(model, data)
         tau[k] = data.qfrc_inverse
-    return tau + np.asarray(model.dof_frictionloss) * np.tanh(qd / 0.01)
+    return tau + dry(arm, qd)

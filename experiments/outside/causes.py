@@ -3,6 +3,8 @@
 Each takes the joints it may choose and `ratio`, the size that it aims at in units of torque noise.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import physics
 from arms import Arm, Body, draw_body, inverse, perturb_links
@@ -136,17 +138,16 @@ def need_rotor(d: Draft, j: int, least: float):
 def backlash(d: Draft, ratio: float):
     j = d.one()[0]
     need_rotor(d, j, 0.3 * d.inertia()[j])
-    gap = d.rng.uniform(1e-3, 8e-3)
+    gap = min(d.rng.uniform(1e-3, 6e-3) * max(1.0, ratio / 10), 0.03)
     inertia, rotor = d.inertia()[j], float(d.user.of("armature")[j])
     stiffness = min(d.load()[j] / 3e-4, rotor * 500**2)
-    key = d.add("backlash", [j], [("gap", j, float(gap), "rad")])
+    d.add("backlash", [j], [("gap", j, float(gap), "rad")])
     d.allow("joint_elasticity", [j])
     d.gears.append(Gear(j, stiffness, 0.3 * np.sqrt(stiffness * inertia), rotor, gap / 2))
-    assert key
 
 
 def joint_elasticity(d: Draft, ratio: float):
-    load = d.load()
+    load = d.load(moving=False)
     j = d.one(np.argsort(-load)[: max(2, d.n // 2)])[0]
     need_rotor(d, j, 0.1 * d.inertia()[j])
     stiffness = float(max(load[j] ** 2 / (ratio * d.noise[j]), 25 * load[j]))
@@ -251,9 +252,9 @@ def torque_offset(d: Draft, ratio: float):
 
 
 def torque_gain(d: Draft, ratio: float):
-    load = d.load() + d.user.of("frictionloss")
+    load = d.load(moving=False) + d.user.of("frictionloss")
     joints = d.one(np.argsort(-load)[: max(3, d.n // 2)])
-    error = np.clip(ratio * d.noise / load, 0.01, 0.3) * d.rng.choice([-1, 1], d.n)
+    error = np.clip(ratio * d.noise / np.maximum(load, d.noise), 0.01, 0.3) * d.rng.choice([-1, 1], d.n)
     gain = 1 + d.at(joints, error)
     key = d.add("torque_gain", joints, per_joint("gain", joints, gain, "1"), ["inertial_parameters"])
     d.torque.append((key, lambda d, log, tau: gain * tau))
@@ -271,7 +272,7 @@ def torque_drift(d: Draft, ratio: float):
 
 
 def torque_crosstalk(d: Draft, ratio: float):
-    load = d.load()
+    load = d.load(moving=False)
     source = d.one(np.argsort(-load)[:3])[0]
     j = d.one([k for k in range(d.n) if k != source])[0]
     share = float(np.clip(ratio * d.noise[j] / load[source], 0.005, 0.2) * d.rng.choice([-1, 1]))
@@ -284,16 +285,16 @@ def torque_crosstalk(d: Draft, ratio: float):
 
 
 def encoder_offset(d: Draft, ratio: float):
-    load = d.load()
+    load = d.load(moving=False)
     j = d.one(np.argsort(-load)[:3])[0]
-    offset = float(np.clip(ratio * d.noise[j] / load[j], 0.004, 0.1) * d.rng.choice([-1, 1]))
+    offset = float(np.clip(1.5 * ratio * d.noise[j] / load[j], 0.004, 0.1) * d.rng.choice([-1, 1]))
     key = d.add("encoder_offset", [j], [("offset", j, offset, "rad")])
     d.encoders.append((key, np.eye(d.n)[j] * offset))
 
 
 def time_delay(d: Draft, ratio: float):
     """The torque column lags by `delay`; a negative one means that the motion does."""
-    steps = int(d.rng.integers(4, 50)) * int(d.rng.choice([-1, 1], p=[0.3, 0.7]))
+    steps = int(d.rng.integers(4, 40 if ratio < 4 else 80)) * int(d.rng.choice([-1, 1], p=[0.3, 0.7]))
     key = d.add("time_delay", None, [("delay", None, steps * DT, "s")])
     d.torque.append((key, lambda d, log, tau: shifted(tau, steps)))
 
@@ -312,7 +313,7 @@ def external_contact(d: Draft, ratio: float):
     j = d.n - 1
     told = [
         ("force", j, size, "N"),
-        *((f"direction_{a}", j, float(x), "1") for a, x in zip("xyz", direction, strict=False)),
+        *((f"direction_{a}", j, float(x), "1") for a, x in zip("xyz", direction, strict=True)),
     ]
     key = d.add("external_contact", None, told, intervals=[(begin, end)])
     d.laws.append(physics.Contact(key, size * direction, begin, end, 0.15))
@@ -385,7 +386,7 @@ def velocity_product(d: Draft, ratio: float):
 
 
 def flange_drag(d: Draft, ratio: float):
-    scale = float(ratio * np.median(d.noise) / (0.5 * 0.5**2))
+    scale = float(ratio * np.median(d.noise) / (0.5 * 0.25**2))
     d.laws.append(physics.FlangeDrag(d.add("unknown", None, what="flange_drag"), scale))
 
 
@@ -404,16 +405,10 @@ def link_length(d: Draft, ratio: float):
     error = float(d.rng.uniform(5e-3, 15e-3) * d.rng.choice([-1, 1]))
     link = d.user.links[k]
     grown = link.offset * (1 + error / np.linalg.norm(link.offset))
-    links = tuple(replace_link(a, grown) if i == k else a for i, a in enumerate(d.user.links))
+    links = tuple(replace(a, offset=grown) if i == k else a for i, a in enumerate(d.user.links))
     told = [("length_error", k - 1, error, "m")]
     key = d.add("unknown", None, told, ["inertial_parameters"], what="link_length")
     d.steps.append(Step(key, replace_arm(links=links)))
-
-
-def replace_link(link, offset):
-    from dataclasses import replace
-
-    return replace(link, offset=offset)
 
 
 def cable_wrap(d: Draft, ratio: float):
@@ -428,7 +423,7 @@ def cable_wrap(d: Draft, ratio: float):
 
 def sensor_hysteresis(d: Draft, ratio: float):
     """Play in the torque sensor: what it says follows the torque with the memory of Bouc and Wen."""
-    load = d.load()
+    load = d.load(moving=False)
     joints = d.one(np.argsort(-load)[:3])
     width = d.at(joints, 0.5 * load)
     size = d.at(joints, 1.4 * ratio * d.noise)
@@ -451,9 +446,9 @@ def sensor_hysteresis(d: Draft, ratio: float):
 
 def sensor_saturation(d: Draft, ratio: float):
     """The sensor cannot say more than a certain torque."""
-    load = d.load()
+    load = d.load(moving=False)
     joints = d.one(np.argsort(-load)[:3])
-    limit = np.where(d.at(joints, 1.0) > 0, d.rng.uniform(0.6, 1.1) * load, np.inf)
+    limit = np.where(d.at(joints, 1.0) > 0, d.rng.uniform(0.5, 0.9) * load, np.inf)
     key = d.add(
         "unknown", joints, [("limit", j, float(limit[j]), NM) for j in joints], what="sensor_saturation"
     )

@@ -116,11 +116,11 @@ class Draft:
             own[j] = row[j]
         return own
 
-    def load(self) -> np.ndarray:
-        """RMS torque at each joint over poses and accelerations of its motions."""
+    def load(self, moving: bool = True) -> np.ndarray:
+        """RMS torque at each joint over poses and accelerations of its motions, or at rest."""
         rng = np.random.default_rng(0)
         q = self.user.home + self.user.reach * rng.uniform(-1, 1, (60, self.n))
-        qdd = 1.2 * self.user.speed * rng.standard_normal(q.shape)
+        qdd = moving * 0.8 * self.user.speed * rng.standard_normal(q.shape)
         arm = self.user.with_joint(damping=np.zeros(self.n), frictionloss=np.zeros(self.n))
         return np.sqrt(np.mean(inverse(arm, q, 0 * q, qdd) ** 2, axis=0))
 

@@ -154,20 +154,21 @@ def several(d: Draft):
         pool[k](d, draw_ratio(d.rng))
 
 
-def single(d: Draft, name: str):
+def single(d: Draft, name: str, boost: float):
     maybe_known_friction(d)
-    getattr(causes, name)(d, draw_ratio(d.rng))
+    getattr(causes, name)(d, boost * draw_ratio(d.rng))
 
 
-def outside(d: Draft, name: str):
+def outside(d: Draft, name: str, boost: float):
     maybe_known_friction(d)
-    getattr(causes, name)(d, max(draw_ratio(d.rng), 3.0))
+    getattr(causes, name)(d, boost * max(draw_ratio(d.rng), 3.0))
 
 
-def draw(rng: np.random.Generator, kind: str, detail: str) -> Draft:
+def draw(rng: np.random.Generator, kind: str, detail: str, boost: float = 1.0) -> Draft:
+    """A case of a kind; a lone cause aims at `boost` times the usual size."""
     d = base(rng, kind)
     if detail:
-        {"single": single, "outside": outside}[kind](d, detail)
+        {"single": single, "outside": outside}[kind](d, detail, boost)
     else:
         globals()[kind](d)
     return d

@@ -13,13 +13,14 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from arms import inverse, mjcf
+from arms import dry, inverse, mjcf
 from draft import FAMILY_OF, Draft, Entry
 from kinds import SHARES, STRATUM, draw, schedule
 from motion import FAMILIES, draw_motion
 from plant import Log, simulate
 from sensors import CUTS, encoder, rows_of, smooth, torque_noise, usable, velocity
 
+SHARE_OF_FAMILY = (0.2, 0.2, 0.15, 0.12, 0.1, 0.06, 0.17)
 MOST_ROWS = 15000  # of one recording
 
 
@@ -37,6 +38,7 @@ class Recording:
         self.by_key = torque_by_key(d, log, rows)
         self.tau_clean = self.by_key.pop("recorded")
         self.extra = self.tau_clean - inverse(d.user, *self.clean)
+        self.dry = dry(d.user, self.clean[1])
         self.t = stamps(d, log.t[rows])
         q = encoder(d.sensors, d.rng, log.q + offset)
         self.q, self.dq = q[rows], velocity(d.sensors, q, rows, self.t)
@@ -44,17 +46,27 @@ class Recording:
         self.tau = self.tau_clean + noise
 
     def residuals(self, d: Draft) -> tuple[np.ndarray, np.ndarray]:
-        """RMSE of the user's model and of the true one on the noisy motion, with the best of some filters."""
+        """RMSE of the user's model and of the true one on the noisy motion, with the best of some filters.
+
+        The true model knows the hidden states of the effects that are listed and where the file's friction
+        turns. Where that is no better than the file (a stuck joint shares its load with the known friction in a
+        way that only both together tell), it is the file.
+        """
         keep = usable(self.t)
         noise = d.noise * d.noise_scale
+        keys = {entry.key for entry in d.entries}
+        listed = sum((x for key, x in self.by_key.items() if key in keys), np.zeros_like(self.tau))
         best = None
         for cut in CUTS:
-            nominal = self.tau - inverse(d.user, *smooth(self.t, self.q, cut))
-            both = [np.sqrt(np.mean(x[keep] ** 2, axis=0)) for x in (nominal, nominal - self.extra)]
+            motion = smooth(self.t, self.q, cut)
+            nominal = self.tau - inverse(d.user, *motion)
+            true = nominal + dry(d.user, motion[1]) - self.dry - listed if keys else nominal
+            both = [np.sqrt(np.mean(x[keep] ** 2, axis=0)) for x in (nominal, true)]
             score = np.sum((both[1] / noise) ** 2)
             if best is None or score < best[0]:
                 best = score, both
-        return best[1]
+        nominal, true = best[1]
+        return nominal, np.minimum(nominal, true)
 
     def write(self, path: Path, torque: bool):
         n = self.q.shape[1]
@@ -197,15 +209,19 @@ def truth_of(d: Draft, kind: str, detail: str, family: str, trains: list[Recordi
 
 def make_case(job: tuple[int, int, str, str, str]) -> str:
     seed, index, kind, detail, out = job
-    # a draft whose arm leaves its reference is drawn again, from the same seed's next stream
+    # A draft whose arm leaves its reference is drawn again, from the seed's next stream; so, a few times and aiming
+    # higher, is a lone cause that came out below the noise. One in five of these stays.
+    boost = 1.0
     for attempt in range(8):
         rng = np.random.default_rng([seed, index, attempt])
         try:
-            d = draw(rng, kind, detail)
+            d = draw(rng, kind, detail, boost)
             trains, held, family = record(d)
-            break
         except FloatingPointError:
             continue
+        if attempt > 2 or visible(d, trains) or rng.random() < 0.2:
+            break
+        boost *= 3.0
     else:
         raise RuntimeError(f"case {index} ({kind} {detail}) found no stable draw")
     folder = Path(out) / f"case_{index:03d}"
@@ -215,16 +231,24 @@ def make_case(job: tuple[int, int, str, str, str]) -> str:
         recording.write(folder / f"train_{k}.csv", torque=True)
     held.write(folder / "heldout_motion.csv", torque=False)
     held.write(folder / "heldout.csv", torque=True)
-    np.savez_compressed(folder / "hidden.npz", train_0=trains[0].extra, heldout=held.extra)
+    # what the clean column has beyond the file's dynamics without dry friction, for check.py
+    np.savez_compressed(folder / "hidden.npz", train_0=trains[0].extra + trains[0].dry)
     truth = truth_of(d, kind, detail, family, trains, held)
     (folder / "truth.json").write_text(json.dumps(truth, indent=1))
     return f"{folder.name} {kind} {detail} {d.user.name} {family} {d.sensors.fs} Hz {d.seconds:.0f} s"
 
 
+def visible(d: Draft, trains: list[Recording]) -> bool:
+    """Does a lone cause show above the noise somewhere? (Others are left as they are drawn.)"""
+    if len(d.entries) != 1:
+        return True
+    return bool(np.any(rms_of(d.entries[0], trains, d.n) >= 1.2 * d.noise * d.noise_scale))
+
+
 def record(d: Draft):
     """The recordings of a draft: one or two to learn from, one held out, on one clock."""
     d.seconds = min(d.seconds, MOST_ROWS / d.sensors.fs)
-    family = str(d.rng.choice(FAMILIES))
+    family = str(d.rng.choice(FAMILIES, p=SHARE_OF_FAMILY))
     trains = [Recording(d, family, d.seconds, 0.0, holes=True)]
     clock = d.seconds + 5.0
     if d.rng.random() < 0.25:
