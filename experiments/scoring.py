@@ -4,8 +4,8 @@
 
 Reads the truths and the answers that `concealed/score.py` leaves (which prints these figures too). A *place* is
 an effect at a joint; effects of the whole arm have one place without a joint. Truths count for recall where they
-make at least the torque noise. A claim is right where name (or an equally right one, `also` in the truth) and joint
-agree with a truth of any size, and left out where the truth calls it `allowed`. Families: shared/INTERFACE.md.
+make at least the torque noise. A claim is right where name (or an equally right one, `also` in the truth) and
+joint agree with a truth of any size, and left out where the truth calls it `allowed`. Families: INTERFACE.md.
 """
 
 import argparse

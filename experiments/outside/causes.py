@@ -86,7 +86,9 @@ def friction_drift(d: Draft, ratio: float):
     d.dry(key, 0.6 * a, level=physics.warming(0.6 * a, 0.0, time))
     viscous = 0.4 * a / (2 * MOVING * d.user.speed)
     d.laws.append(physics.WarmingViscous(key, viscous, 0.0, time))
-    d.allow("presliding_hysteresis", joints)
+    # what of the surplus lasts through the recording is friction of the plain kinds
+    for name in ("presliding_hysteresis", "coulomb_friction", "viscous_friction"):
+        d.allow(name, joints)
 
 
 def presliding_hysteresis(d: Draft, ratio: float):
@@ -322,7 +324,10 @@ def external_contact(d: Draft, ratio: float):
 def torque_meaning(d: Draft, ratio: float):
     kinds = ("gravity_removed", "sign", "unit", "current", "joint_order", "motor_side", "mounting")
     kind = str(d.rng.choice(kinds))
-    key = d.add("torque_meaning", None, what=kind)
+    also = {"mounting": ["gravity_direction"], "gravity_removed": [], "joint_order": []}.get(
+        kind, ["torque_gain"]
+    )
+    key = d.add("torque_meaning", None, also=also, what=kind)
     if kind == "mounting":
         tilt = d.rng.choice([np.pi, np.pi / 2, np.pi / 4])
         d.steps.append(Step(key, replace_arm(gravity=9.81 * np.array([np.sin(tilt), 0, -np.cos(tilt)]))))

@@ -209,8 +209,8 @@ def truth_of(d: Draft, kind: str, detail: str, family: str, trains: list[Recordi
 
 def make_case(job: tuple[int, int, str, str, str]) -> str:
     seed, index, kind, detail, out = job
-    # A draft whose arm leaves its reference is drawn again, from the seed's next stream; so, a few times and aiming
-    # higher, is a lone cause that came out below the noise. One in five of these stays.
+    # A draft whose arm leaves its reference is drawn again, from the seed's next stream; so is, a few times and
+    # aiming higher, a lone cause that came out below the noise. One in five of these stays.
     boost = 1.0
     for attempt in range(8):
         rng = np.random.default_rng([seed, index, attempt])
