@@ -138,14 +138,15 @@ def need_rotor(d: Draft, j: int, least: float):
 
 
 def backlash(d: Draft, ratio: float):
-    j = d.one()[0]
+    j = d.one(np.argsort(-d.load(moving=False))[:4])[0]
     need_rotor(d, j, 0.3 * d.inertia()[j])
     gap = min(d.rng.uniform(1e-3, 6e-3) * max(1.0, ratio / 10), 0.03)
     inertia, rotor = d.inertia()[j], float(d.user.of("armature")[j])
-    stiffness = min(d.load()[j] / 3e-4, rotor * 500**2)
+    stiffness = min(d.load()[j] / 5e-4, rotor * 400**2)
     d.add("backlash", [j], [("gap", j, float(gap), "rad")])
     d.allow("joint_elasticity", [j])
-    d.gears.append(Gear(j, stiffness, 0.3 * np.sqrt(stiffness * inertia), rotor, gap / 2))
+    damping = 1.2 * np.sqrt(stiffness * min(inertia, rotor))
+    d.gears.append(Gear(j, stiffness, damping, rotor, gap / 2))
 
 
 def joint_elasticity(d: Draft, ratio: float):
@@ -399,7 +400,7 @@ def flywheel(d: Draft, ratio: float):
     """A spinning tool; its torque is the gyroscope's."""
     axis = d.rng.standard_normal(3)
     axis /= np.linalg.norm(axis)
-    momentum = float(2 * ratio * np.median(d.noise))
+    momentum = float(1.5 * min(ratio, 8.0) * np.median(d.noise))
     d.laws.append(physics.Flywheel(d.add("unknown", None, what="flywheel"), momentum, axis))
 
 

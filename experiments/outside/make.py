@@ -134,12 +134,12 @@ def by_phase(phases, t, q, qd, qdd):
 
 
 def rms_of(entry: Entry, trains: list[Recording], n: int) -> np.ndarray:
-    """RMS torque at each joint while the effect acts."""
+    """RMS torque at each joint while the effect acts, without the controller's first 0.3 s."""
     torque = []
     for recording in trains:
-        inside = np.ones(len(recording.t), bool)
+        inside = recording.t > recording.t[0] + 0.3
         if entry.intervals is not None:
-            inside = np.any([(a <= recording.t) & (recording.t <= b) for a, b in entry.intervals], axis=0)
+            inside &= np.any([(a <= recording.t) & (recording.t <= b) for a, b in entry.intervals], axis=0)
         torque.append(np.broadcast_to(recording.by_key.get(entry.key, 0.0), (len(inside), n))[inside])
     return np.sqrt(np.mean(np.concatenate(torque) ** 2, axis=0))
 
@@ -179,6 +179,7 @@ def truth_of(d: Draft, kind: str, detail: str, family: str, trains: list[Recordi
         stratum = "pair"
     listed = {entry.key for entry in d.entries}
     rest = sum((x for k, x in trains[0].by_key.items() if k not in listed), np.zeros_like(trains[0].tau))
+    rest = rest[usable(trains[0].t)]
     sums = sum(trains[0].by_key.values()) - trains[0].extra
     before, oracle = held.residuals(d)
     train_before, train_oracle = trains[0].residuals(d)

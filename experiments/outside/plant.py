@@ -8,6 +8,9 @@ from arms import Arm, rigid
 from physics import State
 
 DT = 5e-4  # [s]
+LOAD_LAG = (
+    0.01  # [s], of the gear's normal forces behind its torque; without it, friction by load would chatter
+)
 
 
 @dataclass
@@ -76,11 +79,12 @@ def simulate(plant: Plant, reference, user: Arm, clock: float = 0.0) -> Log:
     data.qpos, data.qvel = q_ref[0], qd_ref[0]
     soft = np.array([gear.joint for gear in plant.gears], int)
     kp, kd = gains(plant, model, user, rotor)
+    unwind(plant, model, data)
     feed = plant.help * (user.of("frictionloss") * np.tanh(qd_ref / 0.02) + user.of("damping") * qd_ref)
     motor, speed = q_ref[0].copy(), qd_ref[0].copy()
     log = Log(clock + np.arange(count) * DT, *(np.zeros((count, n)) for _ in range(4)), {})
     log.by_key.update({law.key: np.zeros((count, n)) for law in plant.laws})
-    load, inertial, waiting = np.zeros(n), np.zeros(n), models[1:]
+    load, inertial, waiting = data.qfrc_bias.copy(), np.zeros(n), models[1:]
     for k in range(count):
         t = log.t[k]
         if waiting and t >= waiting[0][0]:
@@ -113,12 +117,21 @@ def simulate(plant: Plant, reference, user: Arm, clock: float = 0.0) -> Log:
         qdd = data.qacc.copy()
         qdd[soft] = acceleration[soft]
         log.q[k], log.qd[k], log.qdd[k], log.tau[k] = q, v, qdd, u
-        load = through
+        load += (through - load) * DT / LOAD_LAG
         speed[soft] += DT * acceleration[soft]
         motor[soft] += DT * speed[soft]
     if not np.all(np.isfinite(log.q)) or np.max(np.abs(log.q - q_ref)) > 0.5:
         raise FloatingPointError("the simulated arm left its reference")
     return log
+
+
+def unwind(plant: Plant, model: mujoco.MjModel, data: mujoco.MjData):
+    """Start with soft gears wound up by gravity, their teeth in touch."""
+    mujoco.mj_forward(model, data)
+    for gear in plant.gears:
+        held = data.qfrc_bias[gear.joint]
+        data.qpos[gear.joint] -= held / gear.stiffness + np.sign(held) * gear.half_gap
+    mujoco.mj_forward(model, data)
 
 
 def gains(plant: Plant, model: mujoco.MjModel, user: Arm, rotor: np.ndarray):
@@ -134,6 +147,8 @@ def gains(plant: Plant, model: mujoco.MjModel, user: Arm, rotor: np.ndarray):
         mujoco.mj_mulM(model, data, row, unit)
         own[j] = row[j]
     for gear in plant.gears:
-        own[gear.joint] += rotor[gear.joint]
-    kp = np.maximum(plant.bandwidth**2 * own, plant.stiffness_floor * user.friction)
+        # in the gap the motor is alone: gains for the whole would make it rattle
+        own[gear.joint] = rotor[gear.joint] + own[gear.joint] * (gear.half_gap == 0.0)
+    loose = np.isin(np.arange(n), [gear.joint for gear in plant.gears if gear.half_gap > 0])
+    kp = np.maximum(plant.bandwidth**2 * own, plant.stiffness_floor * user.friction * ~loose)
     return kp, 2 * 0.8 * np.sqrt(kp * own)
