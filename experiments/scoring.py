@@ -69,7 +69,7 @@ def claims_of(finding: dict) -> list[Place]:
     family = FAMILY_OF.get(name, "unknown")
     if name == "unknown":
         family = finding.get("family") or "unknown"
-    joints = [0] if name in EVERYWHERE else finding["joints"]
+    joints = [0] if name in EVERYWHERE else finding["joints"] or [0]
     return [Place(name, j, family) for j in joints]
 
 
@@ -323,7 +323,10 @@ def main():
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     cases = sorted(path.parent for path in args.cases.glob("*/truth.json"))
-    print(report([case for case in cases if (args.out / case.name / "run.json").exists()], args.out))
+    cases = [case for case in cases if (args.out / case.name / "run.json").exists()]
+    if not cases:
+        raise SystemExit(f"no answers to {args.cases} in {args.out}")
+    print(report(cases, args.out))
 
 
 if __name__ == "__main__":
