@@ -381,6 +381,14 @@ def score(cases, out):
     return table
 
 
+def by_place(cases, out):
+    """The further figures of `experiments/scoring.py`, which imports this file."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from scoring import report
+
+    return report(cases, out)
+
+
 def cases_in(folder):
     found = sorted(path.parent for path in Path(folder).glob("*/truth.json"))
     if not found:
@@ -400,6 +408,7 @@ def main(argv=None):
     cases = cases_in(args.cases)
     run_tool(cases, args.out, args.jobs)
     score(cases, args.out)
+    print("\n" + by_place(cases, args.out))
 
 
 if __name__ == "__main__":
