@@ -93,8 +93,7 @@ def settled(
     while (wider := _wider(premises, state)) is not None:
         log.append(f"the model's numbers as {wider.knowledge!r}, {wider.scale:g} times: searched again")
         other = search(wider.problem, log)
-        gained = other.score - in_noise(premises.problem, state.terms, other.noise).score
-        gained += _price(wider) - _price(premises)
+        gained = other.score + _price(wider) - state.score - _price(premises)
         log.append(f"which is likelier by {gained:.1f}")
         if gained <= 0:
             break

@@ -397,6 +397,11 @@ class Problem:
         return Saturation(self.traces)
 
     @functools.cached_property
+    def noise_scale(self) -> Float[np.ndarray, " dof"]:
+        """By how much each joint's noise was larger in the last model than a saturated one's; where the next begins."""
+        return np.ones(self.dof)
+
+    @functools.cached_property
     def _noises(self) -> dict[tuple, tuple]:
         return {}
 

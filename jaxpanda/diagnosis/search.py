@@ -20,7 +20,6 @@ from .proposals import grids, ranked
 from .shapes import evidence_of, first_steps, refine
 from .state import (
     State,
-    gained_over,
     gains,
     in_noise,
     overlaps,
@@ -60,7 +59,7 @@ def search(problem: Problem, log: list[str] | None = None) -> State:
         return state
     say("another beginning: what is common, at all joints")
     other = climb(problem, with_terms(problem, everywhere(problem, state.noise)), say)
-    gained = gained_over(problem, other, state)
+    gained = other.score - state.score
     say(f"which is likelier by {gained:.1f}")
     return other if gained > 0 else state
 

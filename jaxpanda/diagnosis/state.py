@@ -1,6 +1,7 @@
 """The model at some point of a search, and what each of its terms is worth there."""
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 
@@ -19,15 +20,20 @@ class State:
     noise: Noise
     design: Design
 
-    @property
+    @functools.cached_property
     def score(self) -> float:
-        """Logarithm of the model's probability, up to what all models of these recordings share [nats]."""
-        return score(self.terms, self.design)
+        """Logarithm of the model's probability, up to what all models of these recordings share [nats].
 
-
-def score(terms: Sequence[Term], design: Design) -> float:
-    """Log evidence of a model with these terms, and what was thought of them beforehand [nats]."""
-    return design.log_evidence + sum(t.prior for t in terms)
+        Models may differ in their noise: what is likelier in a noise of its own is likelier.
+        """
+        counted = 0.0
+        for j, r in enumerate(self.design.residual):
+            here = r != 0
+            width = np.full(len(r), self.noise.sigma[j])
+            if self.noise.trust is not None:
+                width = width / np.maximum(self.noise.trust[:, j], 1e-9)
+            counted += float(0.5 * np.sum(r**2) + np.log(width[here]).sum())
+        return self.design.log_evidence - counted + sum(t.prior for t in self.terms)
 
 
 def start(problem: Problem) -> State:
@@ -36,19 +42,28 @@ def start(problem: Problem) -> State:
 
 
 def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
-    """The model with these terms, its noise estimated anew."""
+    r"""The model with these terms, its noise estimated anew.
+
+    What the model leaves of a joint beyond the noise is noise as well until something explains it: the variance is
+    not known, and a law is worth $\tfrac n2 \log$ of what it reduces it by. Else many laws would be called on to
+    explain together what none of them is.
+    """
     noise = problem.noise(terms)
-    return in_noise(problem, terms, noise)
+    scale = problem.noise_scale
+    for _ in range(2):
+        state = in_noise(problem, terms, dataclasses.replace(noise, sigma=noise.sigma * scale))
+        beyond = np.array([_mean_square(left) for left in state.design.left]) * scale**2
+        steps = np.floor(np.log(np.maximum(beyond, 1.0)) / (2 * np.log(_STEP)))
+        found = _STEP**steps
+        if np.all(found == scale):
+            break
+        scale = problem.noise_scale[:] = found
+    return state
 
 
 def in_noise(problem: Problem, terms: Sequence[Term], noise: Noise) -> State:
     """The model with these terms, in some noise."""
     return State(tuple(terms), noise, problem.design(terms, noise))
-
-
-def gained_over(problem: Problem, state: State, other: State) -> float:
-    """By how much a state is likelier than another, both in the first one's noise [nats]."""
-    return state.score - in_noise(problem, other.terms, state.noise).score
 
 
 def places(state: State) -> list[slice]:
@@ -74,13 +89,13 @@ def leftover(state: State) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray,
     design = state.design
     kept = np.arange(len(design.precision)) < len(design.precision) - sum(t.width for t in state.terms)
     bare = Design([A[:, kept] for A in design.columns], design.residual, design.precision[kept])
-    before, after = (np.array([_beyond(e) for e in d.left]) for d in (bare, design))
+    before, after = (np.array([_mean_square(e) - 1 for e in d.left]) for d in (bare, design))
     return before, after
 
 
-def _beyond(left: Float[np.ndarray, " rows"]) -> float:
-    """Mean square of what is left of a joint, whitened, beyond the noise's; rows that do not count are zero."""
-    return float(np.sum(left**2)) / max(np.count_nonzero(left), 1) - 1
+def _mean_square(left: Float[np.ndarray, " rows"]) -> float:
+    """Of what is left of a joint, whitened; rows that do not count are zero."""
+    return float(np.sum(left**2)) / max(np.count_nonzero(left), 1)
 
 
 def energies(state: State) -> Float[np.ndarray, "terms dof rows"]:
@@ -106,3 +121,5 @@ def overlaps(state: State) -> list[tuple[int, int]]:
 
 
 _TOGETHER = 0.02
+_STEP = 1.1
+"""Between the deviations of a joint's noise that are told apart: others' columns are whitened again for each."""
