@@ -79,8 +79,7 @@ def of_law(
                 columns.append(off[:, :, None])
     if effect.dry_width is not None and isinstance(effect, AbstractJointEffect):
         j = effect.joints[0]
-        moving = np.abs(stacked[:, j]) > 0.1 * np.abs(stacked[:, j]).max()
-        level = float(np.sqrt(np.mean(stacked[moving, j] ** 2))) if moving.any() else 0.0
+        level = _level(stacked[:, j])
         if TURN * level > SEEN * std[j]:
             reference = np.concatenate(
                 [t.down(np.tanh(t.channels.qd[:, j] / float(effect.dry_width))) for t in traces]
@@ -91,11 +90,25 @@ def of_law(
     return np.split(np.concatenate(columns, 2), ends)
 
 
-def unresolved(traces: Sequence[Trace], torque: Torque) -> Float[np.ndarray, "rows dof"]:
+def unresolved(
+    traces: Sequence[Trace], effect: AbstractEffect, torque: Torque
+) -> Float[np.ndarray, "rows dof"]:
     """Square of what a law may be off from sample to sample [N² m²]: in proportion to its torque, and to how fast
-    that changes."""
+    that changes; dry friction at rest, by all of it."""
     rates = [np.gradient(tau, t.motion.dt, axis=0) for t, tau in zip(traces, torque, strict=True)]
-    return np.square(UNRESOLVED * np.concatenate(torque)) + np.square(TIMING * np.concatenate(rates))
+    stacked = np.concatenate(torque)
+    off = np.square(UNRESOLVED * stacked) + np.square(TIMING * np.concatenate(rates))
+    if effect.dry and isinstance(effect, AbstractJointEffect):
+        j = effect.joints[0]
+        rests = [np.zeros(t.motion.samples) if t.unsure is None else t.unsure[:, j] for t in traces]
+        off[:, j] += np.square(_level(stacked[:, j]) * np.concatenate(rests))
+    return off
+
+
+def _level(torque: Float[np.ndarray, " rows"]) -> float:
+    """Of dry friction while its joint moves [N m]."""
+    moving = np.abs(torque) > 0.1 * np.abs(torque).max()
+    return float(np.sqrt(np.mean(torque[moving] ** 2))) if moving.any() else 0.0
 
 
 def turning(traces: Sequence[Trace], joint: int) -> Float[np.ndarray, "rows n"]:

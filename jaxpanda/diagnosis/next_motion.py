@@ -364,7 +364,7 @@ def _placed(
             sign,
             np.ones((len(keep), arm.dof)),
         )
-        out.append(posed((new,), (True,), nuisance([new], spread, knowledge), background))
+        out.append(posed((new,), (True,), nuisance([new], spread, knowledge, noise)[0], background))
     return out
 
 

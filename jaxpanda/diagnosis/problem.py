@@ -168,7 +168,7 @@ class Problem:
         torque = [x @ c for x in columns]
         evaluate = lambda other: [x @ c for x in self.full_columns(other)]
         off = tuple(of_law(self.traces, effect, torque, std, evaluate))
-        return Term(effect, columns, deviation, off, unresolved(self.traces, torque), prior)
+        return Term(effect, columns, deviation, off, unresolved(self.traces, effect, torque), prior)
 
     def full_columns(self, effect: AbstractEffect) -> list[Float[np.ndarray, "_time dof _n"]]:
         """Columns of an effect, at all joints."""

@@ -40,6 +40,8 @@ _TRIED = 5
 """Proposals at most that are weighed with their discrepancy."""
 _WINDOW = 0.5
 """Share of the best proposal's log probability from which others are weighed beside it."""
+_PAIRED = 2
+"""Rivals of a term that are tried with another beside them."""
 _ROUNDS = 4
 _CROWDED = 4
 """Terms from which another beginning is tried."""
@@ -84,8 +86,8 @@ def taken(problem: Problem, design: Design, noise: Noise, proposal: Proposal) ->
     return problem.term(proposal.effect, proposal.deviation, c, noise.std, prior)
 
 
-Choice = tuple[float, Term]
-"""By how much a model gets likelier with a term, and the term."""
+Choice = tuple[float, tuple[Term, ...]]
+"""By how much a model gets likelier with some terms, and the terms."""
 
 
 def choices(
@@ -98,7 +100,7 @@ def choices(
     for p in some:
         term = taken(problem, design, noise, p)
         more = problem.design((*terms, term), noise)
-        out.append((more.log_evidence - own + term.prior, term))
+        out.append((more.log_evidence - own + term.prior, (term,)))
     return sorted(out, key=lambda choice: -choice[0])
 
 
@@ -115,7 +117,7 @@ def grow(problem: Problem, state: State, say: Any) -> State:
         found = choices(problem, state.terms, state.design, state.noise, new)
         if not found or found[0][0] < BETTER:
             return state
-        gained, term = found[0]
+        gained, (term,) = found[0]
         say(f"add {name(term)}: {gained:.1f}")
         state = settle(problem, with_terms(problem, (*state.terms, term)))
         joints = set(np.flatnonzero(shares(state)[-1] > _FELT).tolist())
@@ -138,11 +140,10 @@ def exchange(problem: Problem, state: State, say: Any) -> State:
     for i in range(len(state.terms)):
         own, best = gains(state)[i], instead(problem, state, i)[0]
         if best[0] > own + BETTER:
-            if best[1].key != state.terms[i].key:
-                say(f"{name(best[1])} for {name(state.terms[i])}: {best[0]:.1f} for {own:.1f}")
-            terms = list(state.terms)
-            terms[i] = best[1]
-            state = with_terms(problem, terms)
+            if [t.key for t in best[1]] != [state.terms[i].key]:
+                said = ", ".join(map(name, best[1]))
+                say(f"{said} for {name(state.terms[i])}: {best[0]:.1f} for {own:.1f}")
+            state = with_terms(problem, (*state.terms[:i], *best[1], *state.terms[i + 1 :]))
     return state
 
 
@@ -175,8 +176,8 @@ def merge(problem: Problem, state: State, say: Any) -> State:
             )
             if found and found[0][0] > own + BETTER:
                 gone = ", ".join(name(state.terms[i]) for i in group)
-                say(f"{name(found[0][1])} for {gone}: {found[0][0]:.1f} for {own:.1f}")
-                state = grow(problem, with_terms(problem, (*others, found[0][1])), say)
+                say(f"{name(found[0][1][0])} for {gone}: {found[0][0]:.1f} for {own:.1f}")
+                state = grow(problem, with_terms(problem, (*others, *found[0][1])), say)
                 break
         else:
             return state
@@ -194,10 +195,24 @@ def instead(problem: Problem, state: State, i: int) -> list[Choice]:
         }  # fmt: skip
         proposals = _new(others, ranked(problem, rest, state.noise, acts))
         found = choices(problem, others, rest, state.noise, proposals) if proposals else []
+        if isinstance(term.effect, AbstractJointEffect):
+            rivals = [choice for choice in found if choice[1][0].key != term.key][:_PAIRED]
+            found += [pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts))]
         own = state.design.log_evidence - rest.log_evidence + term.prior
-        found = sorted([(own, term), *found], key=lambda choice: -choice[0])
+        found = sorted([(own, (term,)), *found], key=lambda choice: -choice[0])
         cache[key] = (found, state)  # the state is kept, lest its parts' identities be used again
     return cache[key][0]
+
+
+def _with_another(
+    problem: Problem, others: Sequence[Term], noise: Noise, choice: Choice, joints: Collection[int]
+) -> Choice | None:
+    """A choice and what is likeliest beside it in the same joints; None where nothing is."""
+    terms = (*others, *choice[1])
+    design = problem.design(terms, noise)
+    proposals = [p for p in _new(terms, ranked(problem, design, noise, joints)) if p.evidence > 0]
+    found = choices(problem, terms, design, noise, proposals) if proposals else []
+    return (choice[0] + found[0][0], (*choice[1], *found[0][1])) if found and found[0][0] > 0 else None
 
 
 def _new(terms: Sequence[Term], proposals: Sequence[Proposal]) -> list[Proposal]:
@@ -211,8 +226,9 @@ def posterior(problem: Problem, state: State, i: int) -> dict[str, float]:
     weights = np.array([0.0, *(gained for gained, _ in found)]) / TEMPERATURE
     shares_ = np.exp(weights - scipy.special.logsumexp(weights))
     out: dict[str, float] = {}
-    for (_, term), p in zip(found, shares_[1:], strict=True):
-        out[term.effect.title] = out.get(term.effect.title, 0.0) + float(p)
+    for (_, terms), p in zip(found, shares_[1:], strict=True):
+        for title in {t.effect.title for t in terms}:
+            out[title] = out.get(title, 0.0) + float(p)
     return out
 
 

@@ -81,6 +81,8 @@ class Trace:
     """What a sample weighs in each joint, 0 to 1: less where nothing tells which way known friction points, and
     where the motion is sharper than the filter of q lets through; none where the joint never moves, as friction
     at rest may carry any part of its load, and none where its torque is stuck."""
+    unsure: Float[np.ndarray, "time dof"] | None = None
+    """1 where the sign of a joint's velocity cannot be told, else 0: friction at rest may carry any load."""
     stuck: tuple[tuple[int, float, float], ...] = ()
     """Joint, start and stop [s] of stretches in which measured torque repeats itself although it must change."""
 
@@ -201,7 +203,7 @@ def prepare(
         stuck = _stuck(recording.time, recording.tau, motion, noise)
     for joint, start, stop in stuck:
         trust[(motion.time > start - _NEAR) & (motion.time < stop + _NEAR), joint] = 0.0
-    return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust, stuck)
+    return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust, doubtful, stuck)
 
 
 def _stuck(

@@ -40,7 +40,8 @@ _LOBE = 3
 def standing_off(problem: Problem, state: State) -> Finding | None:
     """The joint that is farthest beyond its noise where nothing was found, and when it is; None if none is."""
     parts = zip(problem.residual, problem.nuisance, problem.traces, problem.active, strict=True)
-    x = problem.explained(state.design.x)[: problem.nuisance[0].shape[2]]
+    x = state.design.x[: problem.nuisance[0].shape[2]].copy()
+    x[problem.shaken] = 0.0
     suspect = [(r - n @ x, trace) for r, n, trace, on in parts if on]
     left = np.concatenate([e for e, _ in suspect])
     weights = np.concatenate([trace.weights for _, trace in suspect])

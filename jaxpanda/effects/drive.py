@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from ..arm import Arm
 from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Numbers, Shape
+from .friction import CORRECTED
 from .motion import Channels, Joint, Motion
 from .twist import Law, low_passed, twist_torque
 
@@ -35,6 +36,10 @@ class Armature(AbstractInstantEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["Armature"]:
         return [cls(j, "signed" if arm.armature[j] > 0 else "") for j in range(arm.dof)]
+
+    @property
+    def form_prior(self) -> float:
+        return CORRECTED - self.prior if self.form else 0.0
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:

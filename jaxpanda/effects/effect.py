@@ -187,6 +187,11 @@ class AbstractEffect(eqx.Module):
         return None
 
     @property
+    def dry(self) -> bool:
+        """Whether it is friction that may carry any load up to its level while its joint rests."""
+        return self.dry_width is not None
+
+    @property
     def feels(self) -> Literal["motion", "load", "acceleration"]:
         """What its torque follows besides position, velocity and time. A simulator takes the load of the step
         before, but solves for the acceleration: torque in its proportion is inertia, and bears no lag."""

@@ -27,6 +27,8 @@ _WIDTH = Shape("v0", "rad/s", 1e-3, 0.3)
 
 COMMON = -15.0
 """Prior of friction that every gear has."""
+CORRECTED = -10.0
+"""Prior of a number of the user's model that is wrong: many are round, and nobody measured them."""
 PROPORTIONAL = 1.25
 """Exponent of the speed, or one over it, up to which friction is called proportional to it."""
 
@@ -50,6 +52,10 @@ class ViscousFriction(AbstractInstantEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["ViscousFriction"]:
         return [cls(j, "signed" if arm.damping[j] > 0 else "") for j in range(arm.dof)]
+
+    @property
+    def form_prior(self) -> float:
+        return CORRECTED - self.prior if self.form else 0.0
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -88,6 +94,10 @@ class CoulombFriction(AbstractDryFriction):
     def grid(cls, arm: Arm) -> Sequence["CoulombFriction"]:
         form = ["signed" if level > 0 else "" for level in np.asarray(arm.frictionloss)]
         return [cls(j, v0, form[j]) for v0 in (0.003, 0.01, 0.03, 0.1) for j in range(arm.dof)]
+
+    @property
+    def form_prior(self) -> float:
+        return CORRECTED - self.prior if self.form else 0.0
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -463,7 +473,7 @@ class FrictionDrift(AbstractDryFriction):
 
     @property
     def held(self) -> tuple[type[AbstractEffect], ...]:
-        return () if self.form.endswith("extra") else tuple(type(law) for law in self.steady)
+        return tuple(type(law) for law in self.steady)
 
     def variants(self, arm: Arm) -> Sequence["FrictionDrift"]:
         return [dataclasses.replace(self, form=form) for form in ("both", "both extra") if form != self.form]

@@ -84,6 +84,10 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         return f"tau = {torque}, {law}"
 
     @property
+    def dry(self) -> bool:
+        return True
+
+    @property
     def held(self) -> tuple[type[AbstractEffect], ...]:
         return (CoulombFriction,) if self._extent == "whole" else ()
 
