@@ -221,14 +221,17 @@ def _new(terms: Sequence[Term], proposals: Sequence[Proposal]) -> list[Proposal]
 
 
 def posterior(problem: Problem, state: State, i: int) -> dict[str, float]:
-    """Probability of each effect in a term's place, the other terms given; none at all takes the rest."""
+    """Probability of each effect in a term's place, the other terms given: of models that have the term's effect, and
+    of others by their first; none at all takes the rest."""
     found = instead(problem, state, i)
     weights = np.array([0.0, *(gained for gained, _ in found)]) / TEMPERATURE
     shares_ = np.exp(weights - scipy.special.logsumexp(weights))
     out: dict[str, float] = {}
+    own = state.terms[i].effect.title
     for (_, terms), p in zip(found, shares_[1:], strict=True):
-        for title in {t.effect.title for t in terms}:
-            out[title] = out.get(title, 0.0) + float(p)
+        titles = [t.effect.title for t in terms]
+        title = own if own in titles else titles[0]
+        out[title] = out.get(title, 0.0) + float(p)
     return out
 
 
@@ -250,7 +253,7 @@ def everywhere(problem: Problem, noise: Noise) -> list[Term]:
             best = max(found, key=lambda choice: choice[0], default=None)
             if best is None or best[0] < BETTER:
                 break
-            terms.append(best[1])
+            terms += best[1]
     return terms
 
 
