@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import CATALOGUE
+from ..effects.drive import Armature
 from ..effects.friction import CoulombFriction, ViscousFriction
 from ..effects.load import InertialParameters
 from ..effects.memory import PreslidingHysteresis
@@ -59,7 +60,8 @@ def numbers(
 ) -> list[Finding]:
     """The model's own numbers as what is wrong, where their refit explains a joint far beyond its noise.
 
-    `changes`: what coefficients of the nuisance mean for standard parameters, damping and frictionloss.
+    `changes`: what coefficients of the nuisance mean for standard parameters, damping, frictionloss
+    and armature.
     """
     n = problem.nuisance[0].shape[2]
     values = changes(state.design.x[:n])
@@ -71,11 +73,13 @@ def numbers(
         [t.motion.regressor @ values[0].ravel() for t in suspect],
         [t.motion.qd * values[1] for t in suspect],
         [t.down(t.sign) * values[2] for t in suspect],
+        [t.motion.qdd * values[3] for t in suspect],
     )
     told = (
         (InertialParameters.name, "mass_change", "kg", "Y(q, dq, ddq) * (change of inertial parameters)"),
         (ViscousFriction.name, "damping", "N·m·s/rad", "damping * dq, beyond the model's"),
         (CoulombFriction.name, "coulomb", "N·m", "coulomb * sign(dq), beyond the model's"),
+        (Armature.name, "armature", "kg·m²", "armature * ddq, beyond the model's"),
     )
     out = []
     for torque, value, std, (name, parameter, unit, law) in zip(felt, values, deviations, told, strict=True):

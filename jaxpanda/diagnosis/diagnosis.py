@@ -15,6 +15,8 @@ from .. import files, markup
 from .. import signals as signals_
 from ..arm import Arm
 from ..corrected import FILE, XML, Corrected, read
+from ..effects import AbstractEffect
+from ..effects.drive import Armature
 from ..errors import InputError, require_x64
 from ..export import (
     ExportResult,
@@ -385,8 +387,10 @@ def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) ->
     """The arm with the terms and, where `refitted`, with what they leave of the nuisance."""
     problem = premises.problem
     x = state.design.x[: problem.nuisance[0].shape[2]] * (1.0 if refitted else 0.0)
-    change, damping, level = premises.changes(x)
-    effects, values = [], []
+    change, damping, level, rotors = premises.changes(x)
+    joints = np.flatnonzero(rotors)
+    effects: list[AbstractEffect] = [Armature(int(j), "signed") for j in joints]
+    values = [jnp.asarray(rotors[j])[None] for j in joints]
     at = len(x) - sum(len(t.deviation) for t in premises.background)
     for term in premises.background if refitted else ():
         effects.append(term.effect)

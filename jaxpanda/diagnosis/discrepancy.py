@@ -105,6 +105,14 @@ def unresolved(
     return off
 
 
+def unresolved_known(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
+    """The same of the friction that the user's model holds; where it rests `Trace.trust` says."""
+    level = np.asarray(traces[0].motion.arm.frictionloss)
+    torque = [level * t.down(t.sign) for t in traces]
+    rates = [np.gradient(tau, t.motion.dt, axis=0) for t, tau in zip(traces, torque, strict=True)]
+    return np.square(UNRESOLVED * np.concatenate(torque)) + np.square(TIMING * np.concatenate(rates))
+
+
 def _level(torque: Float[np.ndarray, " rows"]) -> float:
     """Of dry friction while its joint moves [N m]."""
     moving = np.abs(torque) > 0.1 * np.abs(torque).max()

@@ -73,12 +73,13 @@ def nuisance(
     spread: Float[np.ndarray, "standard n"],
     knowledge: Knowledge,
     std: Float[np.ndarray, " dof"],
+    scale: float = 1.0,
 ) -> tuple[list[Float[np.ndarray, "_time dof _n"]], int]:
     """The columns N of each recording, and how many of them are numbers of the model; the others are what its
-    friction may be off and noise of the encoders, which no knowledge takes away. `std`: of the noise [N m]."""
+    friction may be off and noise of the encoders, which no knowledge takes away. `std`: of the noise [N m]; `scale`
+    multiplies the uncertainty of friction and rotors where it is "rough"."""
     arm = traces[0].motion.arm
-    share = _FRICTION[knowledge]
-    damping, level = share * np.asarray(arm.damping), share * np.asarray(arm.frictionloss)
+    damping, level, armature = friction_spread(arm, knowledge, scale)
     out, numbers = [], 0
     for trace, off in zip(traces, of_known(traces, std), strict=True):
         parts = [trace.motion.regressor @ spread]
@@ -88,22 +89,40 @@ def nuisance(
         sign = trace.down(trace.sign)
         for j in np.flatnonzero(level > 0):
             parts.append((level[j] * sign)[:, :, None] * joints[:, j : j + 1])
+        for j in np.flatnonzero(armature > 0):
+            parts.append((armature[j] * trace.motion.qdd)[:, :, None] * joints[:, j : j + 1])
         numbers = sum(p.shape[2] for p in parts)
         out.append(np.concatenate([*parts, off, _SHAKEN * trace.shaken], 2))
     return out, numbers
 
 
+def friction_spread(
+    arm: Arm, knowledge: Knowledge, scale: float = 1.0
+) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
+    """Deviations of damping, frictionloss and armature."""
+    share = _FRICTION[knowledge] * (scale if knowledge == "rough" else 1.0)
+    rotors = share if knowledge in ("rough", "unknown") else 0.0
+    numbers = np.asarray(arm.damping), np.asarray(arm.frictionloss), np.asarray(arm.armature)
+    return share * numbers[0], share * numbers[1], rotors * numbers[2]
+
+
 def changes(
-    arm: Arm, x: Float[np.ndarray, " columns"], spread: Float[np.ndarray, "standard n"], knowledge: Knowledge
-) -> tuple[Float[np.ndarray, "dof 10"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
-    """What coefficients x of `nuisance` mean: changes of standard parameters, damping and frictionloss."""
+    arm: Arm,
+    x: Float[np.ndarray, " columns"],
+    spread: Float[np.ndarray, "standard n"],
+    knowledge: Knowledge,
+    scale: float = 1.0,
+) -> tuple[
+    Float[np.ndarray, "dof 10"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]
+]:
+    """What coefficients x of `nuisance` mean: changes of standard parameters, damping, frictionloss and armature."""
     inertial = spread.shape[1]
     standard = (spread @ x[:inertial]).reshape(arm.dof, 10)
     friction = []
     done = inertial
-    for value in (np.asarray(arm.damping), np.asarray(arm.frictionloss)):
-        change, here = np.zeros(arm.dof), np.flatnonzero(_FRICTION[knowledge] * value > 0)
-        change[here] = _FRICTION[knowledge] * value[here] * x[done : done + len(here)]
+    for deviation in friction_spread(arm, knowledge, scale):
+        change, here = np.zeros(arm.dof), np.flatnonzero(deviation > 0)
+        change[here] = deviation[here] * x[done : done + len(here)]
         done += len(here)
         friction.append(change)
-    return standard, friction[0], friction[1]
+    return standard, *friction

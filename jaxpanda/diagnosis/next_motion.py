@@ -338,6 +338,7 @@ def _placed(
     """Motions on the grids of a recording, each as a problem of its own, without torque."""
     arm, dt = trace.motion.arm, trace.dt
     stride = int(trace.keep[1] - trace.keep[0])
+    exact = np.full(arm.dof, np.inf)  # no law is taken for wrong
     speeds = [np.gradient(q, dt, axis=0) for q in ways]
     bends = [np.gradient(qd, dt, axis=0) for qd in speeds]
     signs = held_sign(arm, np.concatenate(speeds), np.concatenate(bends), np.full(arm.dof, 1e-4))
@@ -364,7 +365,7 @@ def _placed(
             sign,
             np.ones((len(keep), arm.dof)),
         )
-        out.append(posed((new,), (True,), nuisance([new], spread, knowledge, noise)[0], background))
+        out.append(posed((new,), (True,), nuisance([new], spread, knowledge, exact)[0], background))
     return out
 
 

@@ -49,9 +49,9 @@ class Premises:
 
     def changes(
         self, x: Float[np.ndarray, " n"]
-    ) -> tuple[Float[np.ndarray, "dof 10"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
-        """What coefficients of the nuisance change: standard parameters, damping and frictionloss."""
-        return knowledge_.changes(self.problem.arm, x, self.spread, self.knowledge)
+    ) -> tuple[np.ndarray, ...]:
+        """What coefficients of the nuisance change: standard parameters, damping, frictionloss and armature."""
+        return knowledge_.changes(self.problem.arm, x, self.spread, self.knowledge, self.scale)
 
 
 def pose(
@@ -67,7 +67,7 @@ def pose(
     nothing = tuple(t.motion.q[:, :, None][:, :, :0] for t in traces)
     empty = Problem(traces, active, nothing, saturated=saturated)
     spread = scale * knowledge_.inertial_spread(arm, knowledge, empty.noise(()).std)
-    columns, numbers = knowledge_.nuisance(traces, spread, knowledge, empty.noise(()).std)
+    columns, numbers = knowledge_.nuisance(traces, spread, knowledge, empty.noise(()).std, scale)
     problem = posed(traces, active, columns, background, empty.saturation, numbers)
     return Premises(problem, spread, knowledge, scale, problem.background)
 

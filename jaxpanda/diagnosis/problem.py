@@ -17,7 +17,7 @@ from ..arm import Arm
 from ..effects import AbstractEffect, AbstractJointEffect
 from ..errors import InputError
 from . import catchall
-from .discrepancy import of_law, unresolved
+from .discrepancy import of_law, unresolved, unresolved_known
 from .evidence import Design, Noise, OnDemand
 from .host import parallel
 from .library import Candidates, build, columns_of
@@ -433,9 +433,13 @@ class Problem:
                 " physics from noise; record longer: of seven joints 2 s at 100 Hz or more are enough"
             )
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
-        off = [t.unresolved for t in terms if t.unresolved is not None]
-        trust = 1 / np.sqrt(1 + np.sum(off, 0) / np.square(std)) if off else None
+        off = self._known_unresolved + sum(t.unresolved for t in terms if t.unresolved is not None)
+        trust = 1 / np.sqrt(1 + off / np.square(std))
         return Noise(np.stack(a), np.array(sigma), np.array(std), trust)
+
+    @functools.cached_property
+    def _known_unresolved(self) -> Float[np.ndarray, "rows dof"]:
+        return unresolved_known(self.traces)
 
 
 def _left_out(

@@ -28,7 +28,7 @@ class ExternalContact(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "external_contact"
-    prior: ClassVar[float] = -37.0
+    prior: ClassVar[float] = -45.0
     shapes: ClassVar[tuple[Shape, ...]] = (
         Shape("start", "s", -np.inf, np.inf, False),
         Shape("stop", "s", -np.inf, np.inf, False),
