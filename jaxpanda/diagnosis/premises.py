@@ -25,7 +25,7 @@ from .traces import Trace
 
 RUNGS: tuple[tuple[knowledge_.Knowledge, float, float], ...] = (
     ("identified", 1.0, 0.0),
-    ("identified", 4.0, -5.0),
+    ("identified", 8.0, -5.0),
     ("identified", 20.0, -15.0),
     ("rough", 1.0, -50.0),
     ("rough", 5.0, -75.0),

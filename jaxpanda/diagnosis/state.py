@@ -52,7 +52,7 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
     scale = problem.noise_scale
     for _ in range(2):
         state = in_noise(problem, terms, dataclasses.replace(noise, sigma=noise.sigma * scale))
-        beyond = np.array([_mean_square(left) for left in state.design.left]) * scale**2
+        beyond = mean_squares(state) * scale**2
         steps = np.floor(np.log(np.maximum(beyond, 1.0)) / (2 * np.log(_STEP)))
         found = _STEP**steps
         if np.all(found == scale):
@@ -91,6 +91,11 @@ def leftover(state: State) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray,
     bare = Design([A[:, kept] for A in design.columns], design.residual, design.precision[kept])
     before, after = (np.array([_mean_square(e) - 1 for e in d.left]) for d in (bare, design))
     return before, after
+
+
+def mean_squares(state: State) -> Float[np.ndarray, " dof"]:
+    """Of what is left of each joint's residual, whitened: 1 where it is noise."""
+    return np.array([_mean_square(left) for left in state.design.left])
 
 
 def _mean_square(left: Float[np.ndarray, " rows"]) -> float:

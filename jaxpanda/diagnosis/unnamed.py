@@ -19,7 +19,7 @@ from scipy.signal.windows import hann
 from ..signals import Signals, white_noise
 from .finding import Finding, joined
 from .problem import Problem
-from .state import State
+from .state import State, mean_squares
 
 BEYOND = 4.0
 """Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""
@@ -39,25 +39,29 @@ _LOBE = 3
 
 def standing_off(problem: Problem, state: State) -> Finding | None:
     """The joint that is farthest beyond its noise where nothing was found, and when it is; None if none is."""
-    parts = zip(problem.residual, problem.nuisance, problem.traces, problem.active, strict=True)
+    joints = range(problem.dof)
+    counts = [np.stack([problem.weights(state.noise, r, j) for j in joints], 1) for r in range(len(problem.traces))]
+    parts = zip(problem.residual, problem.nuisance, problem.traces, counts, problem.active, strict=True)
     x = state.design.x[: problem.nuisance[0].shape[2]].copy()
     x[problem.shaken] = 0.0
-    suspect = [(r - n @ x, trace) for r, n, trace, on in parts if on]
-    left = np.concatenate([e for e, _ in suspect])
-    weights = np.concatenate([trace.weights for _, trace in suspect])
+    suspect = [(r - n @ x, trace, count) for r, n, trace, count, on in parts if on]
+    left = np.concatenate([e for e, _, _ in suspect])
+    weights = np.concatenate([count for _, _, count in suspect])
     # what stands off now and then passes for noise of a joint; its torque from sample to sample shows less
     white = np.median([white_noise(t.signals.tau) for t in problem.traces if t.signals.tau is not None], 0)
     noise = np.minimum(state.noise.std, np.where(white > 0, _COLOURED * white, np.inf))  # 0: coarse steps
-    free = np.array([problem.saturation.free(j) for j in range(problem.dof)])
+    free = np.array([problem.saturation.free(j) for j in joints])
     noise = noise * np.sqrt(1 + _UNSURE * np.sqrt(2 / free))
     weight = np.maximum(np.mean(weights**2, 0), 1e-9)
     beyond = np.mean((left / noise * weights) ** 2, 0) / weight
+    # what is slow, as friction that holds a joint at rest somewhere, is beyond noise only if its changes are
+    beyond = np.minimum(beyond, mean_squares(state) * problem.noise_scale**2)
     joint = int(np.argmax(beyond))
     if beyond[joint] < BEYOND:
         return None
     seen = []
-    for e, trace in suspect:
-        power = (e[:, joint] / noise[joint] * trace.weights[:, joint]) ** 2 / weight[joint]
+    for e, trace, count in suspect:
+        power = (e[:, joint] / noise[joint] * count[:, joint]) ** 2 / weight[joint]
         power = scipy.ndimage.uniform_filter1d(power, max(1, round(_SMOOTHED / trace.motion.dt)))
         seen.append((float(power[power > BEYOND].sum()), trace, trace.motion.time[power > BEYOND]))
     _, trace, times = max(seen, key=lambda one: one[0])
