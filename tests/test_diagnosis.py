@@ -314,8 +314,11 @@ def test_what_the_file_cannot_hold_is_said_once(written):
 
 def test_coulomb_s_friction_belongs_to_the_richer_law_at_its_joint():
     term = lambda effect: Term(effect, (), np.ones(1))
-    sticks, stribeck = PreslidingHysteresis(3, 4e-4, "whole"), StribeckFriction(3, 0.1, 0.01, 2.0, "whole")
-    elsewhere = PreslidingHysteresis(4, 4e-4, "whole")
+    sticks, stribeck = (
+        PreslidingHysteresis(3, 4e-4, "dahl whole"),
+        StribeckFriction(3, 0.1, 0.01, 2.0, "whole"),
+    )
+    elsewhere = PreslidingHysteresis(4, 4e-4, "dahl whole")
     assert titles([term(sticks), term(stribeck), term(elsewhere)]) == [
         "stribeck_friction",
         "stribeck_friction",
