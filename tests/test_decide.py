@@ -10,22 +10,19 @@ from helpers import record
 from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.credible import is_of_time
-from jaxpanda.diagnosis.decide import UNLIKELY, WANDERS, crowd, findings, unnamed_where_doubtful
+from jaxpanda.diagnosis.decide import MISLEADS, findings
 from jaxpanda.diagnosis.diagnosis import Fit, verdict
 from jaxpanda.diagnosis.finding import Finding
-from jaxpanda.diagnosis.next_motion import next_motion
 from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.proposals import grids, handicapped, ranked
-from jaxpanda.diagnosis.rivals import ACCEPT
-from jaxpanda.diagnosis.search import divided, most_helpful
+from jaxpanda.diagnosis.proposals import grids
+from jaxpanda.diagnosis.search import climb, search
 from jaxpanda.diagnosis.shapes import refine
-from jaxpanda.diagnosis.state import SHADOW, floors, gains, helped_over, start, with_terms
+from jaxpanda.diagnosis.state import places, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
-from jaxpanda.effects.drive import JointSpring, TorqueRipple
+from jaxpanda.effects.drive import JointSpring
 from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.sensing import TorqueDrift, TorqueOffset
-from jaxpanda.effects.unknown import Unknown
 
 
 def posed(*recordings):
@@ -68,20 +65,20 @@ def test_a_spring_that_stiffens_is_a_spring_wherever_the_joint_moves():
     spring = max(springs, key=lambda p: p.evidence)
     assert isinstance(spring.effect, JointSpring)
     assert (spring.effect.form, spring.effect.joint) == ("cubic", 3)
-    assert spring.evidence > max(handicapped(p).evidence for p in free)
+    assert spring.evidence + spring.effect.prior > max(p.evidence + p.effect.prior for p in free)
 
 
+@pytest.mark.slow
 def test_a_strong_linear_spring_far_from_zero_does_not_stiffen():
     """The prior held the torque that cancels at zero unlikely, so that it came out cubic: MuJoCo has none."""
     pull = lambda t, q, qd, qdd: np.eye(7)[3] * (60.0 * (q[:, [3]] + 1.5))
     problem = posed(record(5, pull), record(6, pull))
-    state = start(problem)
-    library = [g for g in problem.library if (g.name, g.joint) == ("joint_spring", 3)]
-    (spring,) = grids(problem, state.design, state.noise, library)
-    spring = refine(problem, state.design, state.noise, spring)
+    state = search(problem)
+    (spring,) = state.terms
     assert isinstance(spring.effect, JointSpring)
     assert spring.effect.form == "linear"
-    c = with_terms(problem, [problem.term(spring.effect, spring.deviation)]).design.x[-2:]
+    alone = with_terms(problem, [spring.law])  # as the corrected model holds it
+    c = alone.design.x[places(alone)[0]]
     native = spring.effect.mjcf(c, Arm.panda())
     assert native["stiffness"][3] == pytest.approx(60.0, rel=0.01)
     assert native["springref"][3] == pytest.approx(-1.5, abs=0.01)
@@ -113,37 +110,6 @@ def test_a_ripple_of_which_little_is_seen_is_no_spring_with_a_ripple_on_it():
 
     found = diagnose(None, [record(30, ripple)], knowledge="exact")
     assert [(f.effect, f.joints) for f in found.findings] == [("torque_ripple", (3,))]
-
-
-def test_a_curve_of_another_joint_s_motion_stands_in_that_joint_s_shadow():
-    """What a filter leaves of joint 2's reversals shows in joint 4, as a function of joint 2's velocity."""
-    problem = posed(record(3, lambda t, q, qd, qdd: np.tanh(qd / 0.01) * (np.arange(7) == 1)))
-    friction = problem.term(CoulombFriction(1, 0.01), np.array([0.5]))
-    knots = (0.0, 0.1, 0.2)
-    coupled = problem.term(Unknown(3, 1, knots, "odd in dq_k"), np.full(3, 0.1))
-    own = problem.term(Unknown(3, 3, knots, "odd in dq"), np.full(3, 0.1))
-    gained = [1e5, 100.0]
-    assert floors(with_terms(problem, [friction, coupled]), gained)[1] == pytest.approx(
-        SHADOW * 1e5, rel=1e-6
-    )
-    assert floors(with_terms(problem, [friction, own]), gained)[1] == pytest.approx(ACCEPT)
-
-
-def test_a_law_that_takes_away_nearly_all_that_is_left_stands_in_no_shadow():
-    """Beside presliding hysteresis of 190,000 nats load-dependent friction of 3,600 was refused as a leftover."""
-    both = lambda t, q, qd, qdd: np.eye(7)[3] * (10.0 * np.tanh(qd[:, [3]] / 0.01) + q[:, [3]] + 1.57)
-    problem = posed(record(3, both), record(4, both))
-    friction = problem.term(CoulombFriction(3, 0.01), np.array([10.0]))
-    spring = problem.term(JointSpring(3, "linear"), np.ones(2))
-    ripple = problem.term(TorqueRipple(3, 40.0, "one"), np.ones(2))
-    least = {}
-    for term in (spring, ripple):
-        state = with_terms(problem, [friction, term])
-        gained = gains(state)
-        assert ACCEPT < gained[1] < SHADOW * gained[0]
-        least[term.effect.name] = floors(state, gained)[1]
-    assert least["joint_spring"] == pytest.approx(ACCEPT)
-    assert least["torque_ripple"] == pytest.approx(SHADOW * gained[0], rel=0.1)
 
 
 @pytest.mark.slow
@@ -211,7 +177,7 @@ def test_what_comes_again_with_the_motion_is_no_drift(bias, drifts):
     (drift,) = grids(problem, state.design, state.noise, library)
     drift = refine(problem, state.design, state.noise, drift)
     assert isinstance(drift.effect, TorqueDrift)
-    assert drift.evidence > 10 * ACCEPT
+    assert drift.evidence > 250
     assert is_of_time(problem, state.design, state.noise, drift) is drifts
 
 
@@ -226,25 +192,20 @@ def test_friction_that_changes_from_one_repeat_to_the_next_is_a_drift_whatever_s
     assert is_of_time(problem, state.design, state.noise, refine(problem, state.design, state.noise, drift))
 
 
+@pytest.mark.slow
 def test_one_cause_of_what_several_joints_show_comes_before_a_cause_for_each():
-    """A strong spring has more evidence than a base that leans, and is asked after it."""
+    """A base that leans, and a strong spring beside it, are two effects."""
 
     def leans(t, q, qd, qdd):
         columns = Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)).gravity_columns
         return columns @ [0.15, -0.1, 0.0] + 4.0 * (q[:, [2]] - 0.1) * np.eye(7)[2]
 
     problem = posed(record(5, leans), record(6, leans))
-    state = start(problem)
-    proposals = ranked(problem, state.design, state.noise)
-    by_name = {p.effect.name: p for p in reversed(proposals)}
-    assert by_name["joint_spring"].evidence > by_name["gravity_direction"].evidence
-    chosen = most_helpful(problem, state, proposals, lambda _: None)
-    assert chosen is not None
-    assert chosen.effect.name == "gravity_direction"
-    grown = with_terms(problem, [problem.term(chosen.effect, chosen.deviation)])
-    assert helped_over(problem, grown, state) > 100.0 > 0.0 > helped_over(problem, state, grown)
+    found = search(problem)
+    assert {t.key for t in found.terms} == {("gravity_direction", tuple(range(7))), ("joint_spring", (2,))}
 
 
+@pytest.mark.slow
 def test_two_joints_with_something_of_their_own_are_no_wrong_link_beyond_them():
     springs = lambda t, q, qd, qdd: 20.0 * (q - 0.3) * np.eye(7)[1] + 15.0 * (q + 0.2) * np.eye(7)[2]
 
@@ -264,26 +225,18 @@ def test_two_joints_with_something_of_their_own_are_no_wrong_link_beyond_them():
         ]
         (link,) = grids(problem, state.design, state.noise, library)
         wrong = with_terms(problem, [problem.term(link.effect, link.deviation)])
-        found = divided(problem, wrong, lambda _: None)
+        found = climb(problem, wrong, lambda _: None)
         assert {t.key for t in found.terms} == expected
 
 
-def test_laws_of_single_joints_are_no_crowd_for_what_several_show_at_once():
-    where = np.array([[1.0, 0.0], [1.0, 0.0], [1.0, 0.0], [0.6, 0.4]])
-    names, evidence = ["ripple", "offset", "friction", "gravity_direction"], [200.0, 300.0, 400.0, 100.0]
-    found = crowd(where, names, evidence, [False, False, False, True])
-    np.testing.assert_allclose(found, [4, 4, 4, 1])
-    np.testing.assert_allclose(crowd(where, names, evidence, [False] * 4), 4)
-
-
-@pytest.mark.parametrize(("level", "left"), [(0.5, ["unknown"]), (0.02, [])])
-def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_none(level, left):
-    """Alone it is no finding: what it stood for is noise, or has no name."""
-    problem = posed(record(7, lambda t, q, qd, qdd: level * np.tanh(qd / 0.01) * (np.arange(7) == 1)))
+def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_hardly_believed():
+    problem = posed(record(7, lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) == 1)))
     state = with_terms(problem, [problem.term(CoulombFriction(1, 0.01), np.array([0.5]))])
     (sure,) = findings(problem, state, [False])
-    assert sure.effect == "coulomb_friction"
-    assert [(f.effect, f.terms) for f in findings(problem, state, [True])] == [(name, ()) for name in left]
+    (lost,) = findings(problem, state, [True])
+    assert (sure.effect, lost.effect) == ("coulomb_friction", "coulomb_friction")
+    assert sure.confidence > 0.9
+    assert lost.confidence <= MISLEADS
 
 
 @pytest.mark.slow
@@ -293,7 +246,7 @@ def test_what_each_recording_shows_otherwise_is_not_explained():
     found = diagnose(None, [record(30, day(1)), record(31, day(-1))], knowledge="exact")
     assert any("predicted no better" in note for note in found.notes)
     assert found.verdict in ("partly_explained", "unexplained")
-    assert all(f.confidence <= WANDERS for f in found.findings if f.effect != "unknown")
+    assert all(f.confidence <= 0.3 for f in found.findings if f.effect != "unknown")
 
 
 def test_what_acts_along_a_joint_that_slides_is_told_in_newtons_and_metres():
@@ -334,29 +287,3 @@ def test_findings_that_are_not_sure_and_predict_poorly_explain_partly():
     assert verdict(unsure, good, False) == "explained"
     assert verdict([found_as(effect, 0, 0.9), unsure[1]], poor, False) == "explained"
     assert verdict([], poor, False) == "consistent"
-
-
-def test_several_laws_of_which_none_is_likely_are_one_unknown():
-    problem = posed(record(3))
-    terms = [problem.term(CoulombFriction(1, 0.01), np.ones(1)), problem.term(TorqueOffset(4), np.ones(1))]
-    terms.append(problem.term(TorqueOffset(2), np.ones(1)))
-    state = with_terms(problem, terms)
-
-    def finding(i, confidence):
-        return found_as(terms[i].effect, i, confidence)
-
-    sure, doubtful = finding(2, 0.9), [finding(0, 0.9 * UNLIKELY), finding(1, 0.25 * UNLIKELY)]
-    named, unknown = unnamed_where_doubtful(problem, state, [sure, *doubtful])
-    assert named is sure
-    assert (unknown.effect, unknown.joints, unknown.terms) == ("unknown", (1, 4), (0, 1))
-    assert dict(unknown.alternatives)["coulomb_friction"] == pytest.approx(0.9 * UNLIKELY)
-    # it was the likeliest alternative's only, and all together more than one
-    assert unknown.confidence + sum(p for _, p in unknown.alternatives) == pytest.approx(1.0)
-    assert unknown.evidence == pytest.approx(199.0)
-    assert np.all(unknown.rms_torque[[1, 4]] > 0)
-    assert "coulomb friction, torque offset" in unknown.summary
-    assert unknown.parameters == ()
-    assert next_motion(problem, state, [unknown], np.zeros((70, 1)), "exact") is None
-    assert unnamed_where_doubtful(problem, state, doubtful[:1]) == doubtful[:1]
-    rivalled = dataclasses.replace(doubtful[0], alternatives=(("joint_spring", 0.9),))
-    assert unnamed_where_doubtful(problem, state, [sure, rivalled]) == [sure, rivalled]

@@ -141,7 +141,8 @@ def next_motion(
     trace = max(problem.traces, key=lambda t: len(t.channels.t))
     joints = sorted({j for p in pairs for e in (p.a.effect, p.b.effect) for j in e.joints[:1]})
     kinds, ways = zip(*motions(problem, trace, joints), strict=True)
-    new = _placed(trace, ways, spread, knowledge, problem.background)
+    bare = dataclasses.replace(problem, background=(), saturated=problem.saturation)  # as its nuisance was made
+    new = _placed(trace, ways, spread, knowledge, bare.noise(()).std, problem.background)
     quick = _told(problem, new, state.noise, [pair.alone for pair in pairs])
     decidable = [k for k in range(len(pairs)) if max(row[k] for row in quick) >= LEAST]
     if not decidable:
@@ -333,9 +334,11 @@ def _placed(
     ways: Sequence[Float[np.ndarray, "time dof"]],
     spread: Float[np.ndarray, "standard n"],
     knowledge: Knowledge,
+    noise: Float[np.ndarray, " dof"],
     background: Sequence[Term] = (),
 ) -> list[Problem]:
-    """Motions on the grids of a recording, each as a problem of its own, without torque."""
+    """Motions on the grids of a recording, each as a problem of its own, without torque; `noise` is each joint's
+    deviation [N m]."""
     arm, dt = trace.motion.arm, trace.dt
     stride = int(trace.keep[1] - trace.keep[0])
     exact = np.full(arm.dof, np.inf)  # no law is taken for wrong

@@ -143,7 +143,7 @@ class Problem:
         stop = self.shaken.start
         return slice(stop if self.numbers is None else self.numbers, stop)
 
-    def explained(self, x: Float[np.ndarray, " n"], terms: Sequence[Term] = ()) -> Float[np.ndarray, " n"]:
+    def explained(self, x: Float[np.ndarray, " n"], terms: Sequence[Term] = ()) -> Float[np.ndarray, " laws"]:
         """Of a design's coefficients those of the nuisance and of the terms' laws, what belongs to a recording and
         to no model set to zero: the encoders' noise, and what laws are off."""
         count = self.nuisance[0].shape[2]

@@ -131,7 +131,7 @@ class AbstractEffect(eqx.Module):
     @property
     def form_prior(self) -> float:
         """What the form adds to `prior`."""
-        return sum(part.prior for part in self.held)
+        return sum((part.prior for part in self.held), 0.0)
 
     @property
     def title(self) -> str:
