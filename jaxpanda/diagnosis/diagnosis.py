@@ -222,7 +222,7 @@ def diagnose(
             f"{', '.join(trace.name for trace in suspect)}: no joint moves; friction at rest may carry any load,"
             " so that a diagnosis needs motion"
         )
-    log: list[str] = _Log()
+    log: list[str] = []
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
     problem = premises.problem
     state = polished(problem, state)
@@ -500,11 +500,3 @@ def predict(folder: str | Path, motion: str | Path | Recording) -> Float[np.ndar
     tau = corrected.measured_torque(trace.motion, trace.channels, trace.sign)
     grid = trace.motion.time
     return np.stack([np.interp(recording.time, grid, column) for column in tau.T], 1)
-
-
-class _Log(list):
-    def append(self, x):
-        import os, sys, time
-        if os.environ.get("LIVE"):
-            print(f"{time.process_time():.1f}", x[:230], file=sys.stderr, flush=True)
-        super().append(x)

@@ -26,11 +26,9 @@ SEEN = 0.1
 """Discrepancy over the noise's deviation below which it is left out: it would change nothing."""
 SHAPE = 0.3
 """Deviation of a neighbouring shape's share."""
-import os
-TURN = float(os.environ.get("TURN","0.3"))
+TURN = 0.1
 """Deviation of the share of dry friction that turns in another way."""
-import os
-UNRESOLVED, TIMING = float(os.environ.get("UNR", "0.03")), float(os.environ.get("TIM", "0.005"))
+UNRESOLVED, TIMING = 0.03, 0.005
 """Share of its torque by which a law is off in no smooth way, and by how much it may be early or late [s]."""
 _KNOTS = {"q": 5, "qd": 6, "t": 4}
 _PERIOD = 1.5

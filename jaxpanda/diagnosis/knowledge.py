@@ -113,7 +113,10 @@ def changes(
     knowledge: Knowledge,
     scale: float = 1.0,
 ) -> tuple[
-    Float[np.ndarray, "dof 10"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]
+    Float[np.ndarray, "dof 10"],
+    Float[np.ndarray, " dof"],
+    Float[np.ndarray, " dof"],
+    Float[np.ndarray, " dof"],
 ]:
     """What coefficients x of `nuisance` mean: changes of standard parameters, damping, frictionloss and armature."""
     inertial = spread.shape[1]

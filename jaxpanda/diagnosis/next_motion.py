@@ -141,8 +141,7 @@ def next_motion(
     trace = max(problem.traces, key=lambda t: len(t.channels.t))
     joints = sorted({j for p in pairs for e in (p.a.effect, p.b.effect) for j in e.joints[:1]})
     kinds, ways = zip(*motions(problem, trace, joints), strict=True)
-    bare = dataclasses.replace(problem, background=(), saturated=problem.saturation)  # as its nuisance was made
-    new = _placed(trace, ways, spread, knowledge, bare.noise(()).std, problem.background)
+    new = _placed(trace, ways, spread, knowledge, problem.background)
     quick = _told(problem, new, state.noise, [pair.alone for pair in pairs])
     decidable = [k for k in range(len(pairs)) if max(row[k] for row in quick) >= LEAST]
     if not decidable:
@@ -185,7 +184,7 @@ def _told(
     def told(one: Problem) -> list[float]:
         row = []
         for pair, before, already in zip(pairs, old, known, strict=True):
-            more = _pair_sums(one, noise, pair)
+            more = _pair_sums(one, dataclasses.replace(noise, trust=None), pair)
             together = [_added(x, y) for x, y in zip(before, more, strict=True)]
             row.append(_discrimination(pair, together) - already)
         return row
@@ -256,7 +255,8 @@ def _added(x: _Sums, y: _Sums) -> _Sums:
 def _pair_sums(problem: Problem, noise: Noise, pair: _Pair) -> tuple[_Sums, _Sums]:
     """What a leaves for b to imitate, and the other way round."""
     base = []
-    for r, columns in enumerate(problem.nuisance):
+    for r, nuisance in enumerate(problem.nuisance):
+        columns = np.delete(nuisance, problem.known_off, axis=2)
         held = [_wide(problem, _Shapes((t.effect,)), r)[:, :, 0] for t in pair.others]
         base.append(np.concatenate([columns, *held], 2))
     A = [problem.whitened([c[:, j] for c in base], noise, j) for j in range(problem.dof)]
@@ -334,11 +334,10 @@ def _placed(
     ways: Sequence[Float[np.ndarray, "time dof"]],
     spread: Float[np.ndarray, "standard n"],
     knowledge: Knowledge,
-    noise: Float[np.ndarray, " dof"],
     background: Sequence[Term] = (),
 ) -> list[Problem]:
-    """Motions on the grids of a recording, each as a problem of its own, without torque; `noise` is each joint's
-    deviation [N m]."""
+    """Motions on the grids of a recording, each as a problem of its own, without torque; the friction that the model
+    holds is taken for exact there."""
     arm, dt = trace.motion.arm, trace.dt
     stride = int(trace.keep[1] - trace.keep[0])
     exact = np.full(arm.dof, np.inf)  # no law is taken for wrong

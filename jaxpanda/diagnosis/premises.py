@@ -47,9 +47,7 @@ class Premises:
     """What the healthy recordings show; its columns, each times its deviation, end the nuisance."""
     notes: tuple[str, ...] = ()
 
-    def changes(
-        self, x: Float[np.ndarray, " n"]
-    ) -> tuple[np.ndarray, ...]:
+    def changes(self, x: Float[np.ndarray, " n"]) -> tuple[np.ndarray, ...]:
         """What coefficients of the nuisance change: standard parameters, damping, frictionloss and armature."""
         return knowledge_.changes(self.problem.arm, x, self.spread, self.knowledge, self.scale)
 

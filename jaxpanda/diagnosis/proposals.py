@@ -49,7 +49,9 @@ def ranked(
     held = Counter(t.effect.name for t in design.terms)
     best: dict[tuple, Proposal] = {p.key: p for p in before if is_elsewhere(p.effect, where)}
     for p in scanned:
-        times = 1 + (held[p.key[0]] if p.effect.repeats else 0)  # the third push is less likely than the first
+        times = 1 + (
+            held[p.key[0]] if p.effect.repeats else 0
+        )  # the third push is less likely than the first
         prior = times * p.effect.prior - np.log(many[p.key[0]])
         p = dataclasses.replace(p, evidence=p.evidence + prior)
         if p.key not in best or p.evidence > best[p.key].evidence:

@@ -197,7 +197,9 @@ def instead(problem: Problem, state: State, i: int) -> list[Choice]:
         found = choices(problem, others, rest, state.noise, proposals) if proposals else []
         if isinstance(term.effect, AbstractJointEffect):
             rivals = [choice for choice in found if choice[1][0].key != term.key][:_PAIRED]
-            found += [pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts))]
+            found += [
+                pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts))
+            ]
         own = state.design.log_evidence - rest.log_evidence + term.prior
         found = sorted([(own, (term,)), *found], key=lambda choice: -choice[0])
         cache[key] = (found, state)  # the state is kept, lest its parts' identities be used again

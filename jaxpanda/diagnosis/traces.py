@@ -203,7 +203,9 @@ def prepare(
         stuck = _stuck(recording.time, recording.tau, motion, noise)
     for joint, start, stop in stuck:
         trust[(motion.time > start - _NEAR) & (motion.time < stop + _NEAR), joint] = 0.0
-    return Trace(recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust, doubtful, stuck)
+    return Trace(
+        recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust, doubtful, stuck
+    )
 
 
 def _stuck(

@@ -40,7 +40,9 @@ _LOBE = 3
 def standing_off(problem: Problem, state: State) -> Finding | None:
     """The joint that is farthest beyond its noise where nothing was found, and when it is; None if none is."""
     joints = range(problem.dof)
-    counts = [np.stack([problem.weights(state.noise, r, j) for j in joints], 1) for r in range(len(problem.traces))]
+    counts = [
+        np.stack([problem.weights(state.noise, r, j) for j in joints], 1) for r in range(len(problem.traces))
+    ]
     parts = zip(problem.residual, problem.nuisance, problem.traces, counts, problem.active, strict=True)
     x = state.design.x[: problem.nuisance[0].shape[2]].copy()
     x[problem.shaken] = 0.0

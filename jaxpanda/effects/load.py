@@ -168,7 +168,7 @@ class PayloadChange(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "payload_change"
-    prior: ClassVar[float] = -45.0
+    prior: ClassVar[float] = -28.0
     reveals: ClassVar[str] = "the same poses before and after"
     confounded_with: ClassVar[tuple[str, ...]] = ("external_contact", "torque_drift")
     bound_to_recording: ClassVar[bool] = True
@@ -183,7 +183,7 @@ class PayloadChange(AbstractArmEffect):
     @property
     def form_prior(self) -> float:
         """Any push may look like a body held for a while."""
-        return -5.0 if self.form == "carried" else 0.0
+        return -17.0 if self.form == "carried" else 0.0
 
     @property
     def shapes(self) -> tuple[Shape, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
