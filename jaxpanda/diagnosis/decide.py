@@ -36,17 +36,21 @@ REFITTED = 0.9
 """Confidence that a model's numbers are wrong, where their refit explains what differs and nothing else does."""
 
 
-def findings(problem: Problem, state: State, lost: Sequence[bool]) -> list[Finding]:
+def findings(problem: Problem, state: State, laws: State, lost: Sequence[bool]) -> list[Finding]:
     """The accepted terms as findings, those that explain most first.
 
-    `lost`: which of them predict torque no better where they were not fitted.
+    Args:
+        problem: the recordings.
+        state: the likeliest model.
+        laws: the same without discrepancy, as the corrected model has them: what is told of torque and numbers.
+        lost: which of its terms predict torque no better where they were not fitted.
     """
     rivals = [_rivals(problem, state, i) for i in range(len(state.terms))]
     groups = together(problem, state.terms)
     names = titles(state.terms)
     doubt = np.where(lost, MISLEADS, 1.0)
     spread = covariances(problem, state)
-    out = [_finding(problem, state, group, names[group[0]], rivals, doubt, spread) for group in groups]
+    out = [_finding(problem, laws, group, names[group[0]], rivals, doubt, spread) for group in groups]
     # what is in the band of the search belongs to what was found there
     lowest = {"lowest": problem.traces[0].cutoff} if out else {}
     halted = stuck(problem, state.noise.std)

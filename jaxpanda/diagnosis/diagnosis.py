@@ -229,7 +229,7 @@ def diagnose(
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
     kept = transferable(problem, laws)
     lost = [all(t is not k for k in kept.terms) for t in laws.terms]
-    found = tuple(findings(problem, state, lost))
+    found = tuple(findings(problem, state, laws, lost))
     contradicted = premises.knowledge != knowledge or premises.scale > LOOSE
     wrong = numbers(problem, state, premises.changes) if contradicted else []
     found = (*found, *wrong)

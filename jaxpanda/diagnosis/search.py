@@ -23,12 +23,15 @@ from .state import (
     gains,
     in_noise,
     overlaps,
+    places,
     shares,
     start,
     with_terms,
     without,
 )
 
+OPPOSED = 20.0
+"""How many times the torque of a law its parts may be."""
 WORTH = 1.03
 """By which the squared error of predicted torque must be smaller than with the user's model."""
 TEMPERATURE = 3.0
@@ -291,8 +294,10 @@ def transferable(problem: Problem, state: State) -> State:
     """Without the terms that make torque worse where their coefficients were not fitted; without all that can be
     tested so, where together they gain next to nothing.
 
-    What stands in for physics that has no name fits where it was fitted, and misleads elsewhere.
+    What stands in for physics that has no name fits where it was fitted, and misleads elsewhere. So does a law of
+    friction whose parts these speeds do not tell apart.
     """
+    state = with_terms(problem, [t for i, t in enumerate(state.terms) if not is_undetermined(state, i)])
     while lasting := [i for i, t in enumerate(state.terms) if not t.effect.bound_to_recording]:
         whole, users = problem.predicted_error(state.design, state.noise)
         drifting = any(state.terms[i].effect.drifts for i in lasting)
@@ -310,6 +315,16 @@ def transferable(problem: Problem, state: State) -> State:
         else:
             break
     return state
+
+
+def is_undetermined(state: State, i: int) -> bool:
+    """Whether a term is friction whose parts are many times their sum: at other speeds they are not."""
+    term = state.terms[i]
+    if not term.effect.dry:
+        return False
+    parts = np.concatenate(term.columns) * state.design.x[places(state)[i]]
+    rms = lambda torque: float(np.sqrt(np.mean(torque**2)))
+    return max(rms(part) for part in np.moveaxis(parts, -1, 0)) > OPPOSED * rms(parts.sum(-1))
 
 
 def name(term: Term) -> str:

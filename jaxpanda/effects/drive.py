@@ -361,6 +361,11 @@ class Backlash(AbstractArmEffect):
     damping_ratio: Float[Array, ""] | float = 0.2
     form: str = eqx.field(static=True, default="smooth")
 
+    @property
+    def may_hold(self) -> frozenset[str]:
+        """The gear on either side of a gap is soft."""
+        return frozenset({JointElasticity.name})
+
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["Backlash"]:
         return [cls(j, b, 2500.0) for b in (5e-4, 1.5e-3, 4e-3, 0.012, 0.035) for j in range(arm.dof)]

@@ -76,7 +76,7 @@ class CoulombFriction(AbstractDryFriction):
     r"""Friction of constant magnitude, $\tau_j = F_c \tanh(\dot q_j / v_0)$."""
 
     name: ClassVar[str] = "coulomb_friction"
-    shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("v0", "rad/s", 1e-3, 0.06),)
     reveals: ClassVar[str] = "reversals, with dwells between them"
     prior: ClassVar[float] = COMMON
     confounded_with: ClassVar[tuple[str, ...]] = (
@@ -93,7 +93,7 @@ class CoulombFriction(AbstractDryFriction):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["CoulombFriction"]:
         form = ["signed" if level > 0 else "" for level in np.asarray(arm.frictionloss)]
-        return [cls(j, v0, form[j]) for v0 in (0.003, 0.01, 0.03, 0.1) for j in range(arm.dof)]
+        return [cls(j, v0, form[j]) for v0 in (0.003, 0.01, 0.03, 0.06) for j in range(arm.dof)]
 
     @property
     def form_prior(self) -> float:
