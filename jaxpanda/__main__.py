@@ -118,9 +118,10 @@ class Retrieve:
     bounds: Path | None = None
     """CSV with name, lower, upper for each link parameter; without it, the published bounds of the Panda."""
     model: Path | None = None
-    """The arm (MJCF) that bounds are set around when it is not the Panda and --bounds is absent."""
-    weighting: Literal["none", "torque"] = "none"
-    """All coefficients alike, as the paper has it, or each direction by the torque it moved."""
+    """The arm (MJCF) to set bounds around and to stay near to; without it, the one that was identified."""
+    weighting: Literal["auto", "torque", "none"] = "auto"
+    """Each direction of the coefficients by the torque that it moved, or the reliable ones alike, as the paper
+    has it. Unless told, by torque where recordings were identified."""
     processes: str = ""
     """Share the starts with other processes, here or on other machines: RANK/COUNT@HOST:PORT in each of them,
     with ranks from 0 and HOST:PORT free on the machine of rank 0; or `auto` where a launcher such as Slurm says
@@ -153,7 +154,7 @@ class Export:
     out: Path
     """The MJCF to write; a .urdf suffix writes URDF instead."""
     model: Path | None = None
-    """Your MJCF, kept as it is but for the parameters; without it, the project's own Panda."""
+    """Your MJCF, kept as it is but for the parameters; without it, the one that was identified."""
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -176,13 +177,17 @@ class Validate:
     """Folder for validation.json."""
     cutoff: float = 5.0
     """Of the zero-phase low-pass on both torques [Hz]."""
+    no_mjx: bool = False
+    """Leave MJX out, which takes most of the time on a CPU; roll-outs are then C MuJoCo's alone."""
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.validate_files(self.out, self.model, self.recording, cutoff=self.cutoff)
+        return pipeline.validate_files(
+            self.out, self.model, self.recording, cutoff=self.cutoff, in_mjx=not self.no_mjx
+        )
 
 
 @dataclasses.dataclass(frozen=True)
