@@ -1,5 +1,6 @@
 """Every stage's result in sentences, tables and figures: once, for the terminal and for the page."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -167,13 +168,20 @@ def export(written: Any) -> Sequence[Section]:
             f"{change.file}:{change.line}",
             change.element,
             change.attribute,
-            change.old or "–",
-            change.new or "–",
+            _short(change.old) or "–",
+            _short(change.new) or "–",
         ]
         for change in written.changes
     ]
     tables = [Table(["where", "element", "attribute", "was", "is"], rows)] if rows else []
     return [Section("Export", sentences, tables)]
+
+
+def _short(value: str | None) -> str | None:
+    """The numbers of an attribute with six digits; the file holds them whole."""
+    if value is None:
+        return None
+    return re.sub(r"-?\d+\.\d+(?:[eE][-+]?\d+)?", lambda found: f"{float(found[0]):.6g}", value)
 
 
 def validation(checked: Any) -> Sequence[Section]:

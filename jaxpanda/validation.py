@@ -341,6 +341,7 @@ def _copy_options(full: mujoco.MjModel, bare: mujoco.MjModel) -> None:
     bare.opt.integrator = integrator if integrator in runs_in_mjx else kinds.mjINT_IMPLICITFAST
     bare.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     off = mujoco.mjtDisableBit
+    bare.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # MuJoCo 4.0.0 factorises a sparse one wrongly
     bare.opt.disableflags = full.opt.disableflags | off.mjDSBL_CONTACT | off.mjDSBL_ACTUATION
 
 

@@ -16,6 +16,7 @@ cloud need not be, and that a link is:
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import inertia
 from jaxtyping import Float
@@ -43,7 +44,7 @@ def doubts(standard: Float[np.ndarray, "dof 10"], names: Sequence[str], length: 
         names: of the links.
         length: of the arm [m]; None where it is not known, which leaves out what goes by it.
     """
-    mass, _, I_com = (np.asarray(x) for x in jax.vmap(inertia.to_com)(standard))
+    mass, _, I_com = (np.asarray(x) for x in jax.vmap(inertia.to_com)(jnp.asarray(standard)))
     said, thin = [], []
     for name, m, I in zip(names, mass, I_com, strict=True):
         if m < LIGHTEST * mass.sum():
