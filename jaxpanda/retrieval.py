@@ -271,13 +271,13 @@ def retrieve(
     phi, violation = found.phi[found.best], float(found.violation[found.best])
     nominal = None if arm is None else np.asarray(arm.standard)
     notes = _notes(table, found, weighting)
-    held = constraints
-    if nominal is not None and feasible.any() and penalty == "smooth":
+    held, carrying = constraints, arm is not None and arm.lumped is not None
+    if nominal is not None and feasible.any() and penalty == "smooth" and (prefer == "nominal" or carrying):
         room = CONCESSION * best + NOTHING * float(b @ b)
         if weighting == "torque" and table.evidence is not None and table.method == "trajectory":
             room += _conceded(table.evidence.whole.dof * table.evidence.whole.samples + best)
         pulled = _towards(nominal, A, b, boxes, constraints, phi, room)
-        if arm is not None and arm.lumped is not None and not are_buildable(pulled - np.asarray(arm.lumped)):
+        if arm is not None and carrying and not are_buildable(pulled - np.asarray(arm.lumped)):
             further = (*constraints, less_lumped(np.asarray(arm.lumped)))
             beside = _pulled(nominal, A, b, boxes, further, nominal, room)
             if beside.violation[beside.best] == 0:
@@ -289,6 +289,11 @@ def retrieve(
                 )
         if prefer == "nominal" or held is not constraints:
             phi, violation = pulled, 0.0
+            if room > 2 * CONCESSION * best:
+                notes.append(
+                    f"the torque error may be {100 * TORQUE_CONCESSION:g} % higher than it need be, for"
+                    " links nearer to the model's"
+                )
     if prefer != "nominal" or penalty != "smooth":
         nominal = None
     wanted = certificate is True or (
