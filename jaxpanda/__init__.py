@@ -14,6 +14,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    __version__: str
     from .arm import Arm as Arm
     from .corrected import Corrected as Corrected
     from .demo import demonstrate as demonstrate
@@ -64,6 +65,10 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib import metadata
+
+        return metadata.version("jaxpanda")
     if name not in _HOME:
         raise AttributeError(f"module 'jaxpanda' has no attribute {name!r}; it has {', '.join(_HOME)}")
     value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)

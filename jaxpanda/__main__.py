@@ -6,9 +6,12 @@ needs when it runs.
 
 import contextlib
 import dataclasses
+import difflib
 import io
 import os
+import re
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -118,9 +121,10 @@ class Retrieve:
     bounds: Path | None = None
     """CSV with name, lower, upper for each link parameter; without it, the published bounds of the Panda."""
     model: Path | None = None
-    """The arm (MJCF) that bounds are set around when it is not the Panda and --bounds is absent."""
-    weighting: Literal["none", "torque"] = "none"
-    """All coefficients alike, as the paper has it, or each direction by the torque it moved."""
+    """The arm (MJCF) to set bounds around and to stay near to; without it, the one that was identified."""
+    weighting: Literal["auto", "torque", "none"] = "auto"
+    """Each direction of the coefficients by the torque that it moved, or the reliable ones alike, as the paper
+    has it. Unless told, by torque where recordings were identified."""
     processes: str = ""
     """Share the starts with other processes, here or on other machines: RANK/COUNT@HOST:PORT in each of them,
     with ranks from 0 and HOST:PORT free on the machine of rank 0; or `auto` where a launcher such as Slurm says
@@ -153,7 +157,7 @@ class Export:
     out: Path
     """The MJCF to write; a .urdf suffix writes URDF instead."""
     model: Path | None = None
-    """Your MJCF, kept as it is but for the parameters; without it, the project's own Panda."""
+    """Your MJCF, kept as it is but for the parameters; without it, the one that was identified."""
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -176,13 +180,17 @@ class Validate:
     """Folder for validation.json."""
     cutoff: float = 5.0
     """Of the zero-phase low-pass on both torques [Hz]."""
+    no_mjx: bool = False
+    """Leave MJX out, which takes most of the time on a CPU; roll-outs are then C MuJoCo's alone."""
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.validate_files(self.out, self.model, self.recording, cutoff=self.cutoff)
+        return pipeline.validate_files(
+            self.out, self.model, self.recording, cutoff=self.cutoff, in_mjx=not self.no_mjx
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,25 +256,56 @@ def _parse(arguments: list[str]) -> Any:
             )
     except SystemExit as stop:
         if stop.code:
-            raise InputError(_one_line(complaint.getvalue())) from None
+            raise InputError(_sentence(arguments, complaint.getvalue())) from None
         raise
 
 
-def _one_line(panel: str) -> str:
-    """A framed complaint of tyro's as one sentence."""
-    words = " ".join(line.strip("╭╮╰╯│─ ") for line in panel.splitlines())
-    words = (
-        words.replace("•", " ")
-        .replace("For full helptext, run:", "; see")
-        .replace("For full helptext, run", "; see")
-    )
-    return " ".join(words.split()).replace(" ;", ";")
+def _sentence(arguments: list[str], panel: str) -> str:
+    """What is wrong with the arguments, as one sentence; `panel` is how tyro said it."""
+    commands = {command.__name__.lower(): command for command in _COMMANDS}
+    name = arguments[0] if arguments else ""
+    if name not in commands:
+        what = f"no command {name!r}{_meant(name, commands)}" if name else "no command given"
+        return f"{what}; there are {', '.join(commands)}: see jaxpanda --help"
+    fields = {"--" + field.name.replace("_", "-"): field for field in dataclasses.fields(commands[name])}
+    given = [word.split("=")[0].replace("_", "-") for word in arguments[1:] if re.match("--[a-z]", word)]
+    words = " ".join(line.strip("╭╮╰╯│─+|- ") for line in panel.splitlines())  # a frame, of lines or of ASCII
+    text = " ".join(re.sub(r"[-─]{3,}", " ", words).split())
+    unknown = [option for option in given if option not in fields]
+    missing = [
+        option
+        for option, field in fields.items()
+        if option not in given and field.default is dataclasses.MISSING
+    ]
+    if unknown:
+        what = f"{name} has no option {unknown[0]}{_meant(unknown[0], fields)}"
+    elif choice := re.search(r"invalid choice '(.*?)' for argument '(.*?)'.*?\((.*?)\)", text):
+        what = f"{choice[2]} {choice[1]}: is none of {choice[3].replace(chr(39), '')}"
+    elif wrong := re.search(r"Error parsing (--[\w-]+): (.*?) Argument helptext", text):
+        number = re.fullmatch(r"invalid literal for int\(\) with base 10: (.*)", wrong[2])
+        what = f"{wrong[1]}: {number[1]} is no whole number" if number else f"{wrong[1]}: {wrong[2]}"
+    elif missing:
+        what = f"{name} needs {' and '.join(missing)}"
+    else:
+        what = re.sub(r"^[A-Z][a-z]+ [a-z]+ | ?For full helptext.*$", "", text).replace("•", " ").strip()
+    return f"{what}; see jaxpanda {name} --help"
+
+
+def _meant(word: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(word, list(known), 1)
+    return f" (did you mean {close[0]}?)" if close else ""
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit status that docs and INTERFACE promise."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == ["--version"]:
+        from . import __version__
+
+        print(f"jaxpanda {__version__}")
+        return 0
     try:
-        command = _parse(sys.argv[1:] if arguments is None else arguments)
+        command = _parse(arguments)
         from . import session
 
         session.start()

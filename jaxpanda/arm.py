@@ -1,15 +1,19 @@
 """`Arm`: a serial arm with names, units, limits and the physics its model already holds."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxpanda_kernels import Chain, rnea
 from jaxtyping import Array, Float
 
 KNOWN = ("armature", "damping", "frictionloss", "stiffness", "springref")
 """Fields of an `Arm` that hold its physics beyond rigid links."""
+NUMBERS = ("standard", *KNOWN, "lower", "upper")
+"""Fields of an `Arm` that are arrays of its own."""
 
 
 class Arm(eqx.Module):
@@ -37,6 +41,8 @@ class Arm(eqx.Module):
     joint_names: tuple[str, ...] = eqx.field(static=True)
     link_names: tuple[str, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
+    lumped: Float[Array, "dof 10"] | None = None
+    """Of `standard`, what belongs to bodies that are fixed to a link; None where no link has such a body."""
 
     @classmethod
     def from_mjcf(cls, path: str | Path) -> "Arm":
@@ -59,6 +65,31 @@ class Arm(eqx.Module):
     @property
     def dof(self) -> int:
         return self.chain.dof
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as numbers and names; null for a limit that is infinite."""
+        return {
+            "name": self.name,
+            "joint_names": list(self.joint_names),
+            "link_names": list(self.link_names),
+            "chain": {name: np.asarray(getattr(self.chain, name)).tolist() for name in _CHAIN},
+            **{name: _listed(getattr(self, name)) for name in NUMBERS},
+            "lumped": None if self.lumped is None else np.asarray(self.lumped).tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> "Arm":
+        """The inverse of `to_json`; a document that is none raises LookupError, TypeError or ValueError."""
+        R, p, prismatic, gravity = (document["chain"][name] for name in _CHAIN)
+        chain = Chain(jnp.asarray(R), jnp.asarray(p), jnp.asarray(prismatic, bool), jnp.asarray(gravity))
+        return cls(
+            chain,
+            **{name: jnp.asarray(_unlisted(document[name], name)) for name in NUMBERS},
+            joint_names=tuple(document["joint_names"]),
+            link_names=tuple(document["link_names"]),
+            name=document["name"],
+            lumped=None if document.get("lumped") is None else jnp.asarray(document["lumped"]),
+        )
 
     def unit(self, turning: str, joint: int | None = None) -> str:
         """`unit_of` one joint, or of all."""
@@ -84,6 +115,21 @@ class Arm(eqx.Module):
     ) -> Float[Array, " dof"]:
         """Joint torque [N m] of a motion under the model as it is."""
         return rnea(self.chain, self.standard, q, qd, qdd) + self.known_torque(q, qd, qdd)
+
+
+_CHAIN = ("R", "p", "prismatic", "gravity")
+
+
+def _listed(values: Array) -> list[Any]:
+    array = np.asarray(values)
+    return (
+        array.tolist() if np.isfinite(array).all() else [float(v) if np.isfinite(v) else None for v in array]
+    )
+
+
+def _unlisted(values: Sequence[Any], name: str) -> Sequence[Any]:
+    missing = -np.inf if name == "lower" else np.inf
+    return [missing if v is None else v for v in values]
 
 
 def unit_of(turning: str, prismatic: Iterable[bool]) -> str:

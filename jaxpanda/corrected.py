@@ -13,7 +13,7 @@ from jaxpanda_kernels import Chain
 from jaxtyping import Array, Float
 
 from . import files
-from .arm import Arm
+from .arm import NUMBERS, Arm
 from .effects import (
     CATALOGUE,
     AbstractEffect,
@@ -30,7 +30,6 @@ from .errors import InputError
 SCHEMA = "jaxpanda.corrected/1"
 FILE, XML = "corrected.json", "corrected.xml"
 """Names that `diagnose` gives to the corrected arm and to the MJCF with what MuJoCo holds of it."""
-_ARM_FIELDS = ("standard", "armature", "damping", "frictionloss", "stiffness", "springref", "lower", "upper")
 
 
 class Corrected(eqx.Module):
@@ -194,20 +193,9 @@ class Corrected(eqx.Module):
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as numbers and names."""
-        arm = {name: _numbers(getattr(self.arm, name)) for name in _ARM_FIELDS}
-        chain = {
-            name: np.asarray(getattr(self.arm.chain, name)).tolist()
-            for name in ("R", "p", "prismatic", "gravity")
-        }
         return {
             "schema": SCHEMA,
-            "arm": {
-                "name": self.arm.name,
-                "joint_names": list(self.arm.joint_names),
-                "link_names": list(self.arm.link_names),
-                "chain": chain,
-                **arm,
-            },
+            "arm": self.arm.to_json(),
             "change": np.asarray(self.change).tolist(),
             "damping_change": np.asarray(self.damping_change).tolist(),
             "frictionloss_change": np.asarray(self.frictionloss_change).tolist(),
@@ -218,20 +206,20 @@ class Corrected(eqx.Module):
         }
 
     @classmethod
+    def load(cls, folder: str | Path) -> "Corrected":
+        """The corrected arm in a folder that `diagnose` wrote.
+
+        Raises:
+            InputError: there is none, or not as `diagnose` writes it.
+        """
+        return read(folder)[0]
+
+    @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> "Corrected":
         """The inverse of `to_json`."""
-        arm = document["arm"]
-        chain = Chain(
-            jnp.asarray(arm["chain"]["R"]),
-            jnp.asarray(arm["chain"]["p"]),
-            jnp.asarray(arm["chain"]["prismatic"], bool),
-            jnp.asarray(arm["chain"]["gravity"]),
-        )
-        fields = {name: jnp.asarray(_from_numbers(arm[name], name)) for name in _ARM_FIELDS}
-        names = tuple(arm["joint_names"]), tuple(arm["link_names"]), arm["name"]
         effects = [effect_from_json(e) for e in document["effects"]]
         return cls(
-            Arm(chain, **fields, joint_names=names[0], link_names=names[1], name=names[2]),
+            Arm.from_json(document["arm"]),
             jnp.asarray(document["change"]),
             jnp.asarray(document["damping_change"]),
             jnp.asarray(document["frictionloss_change"]),
@@ -263,7 +251,7 @@ def read(folder: str | Path) -> tuple[Corrected, Float[np.ndarray, " dof"]]:
 
 def _check_numbers(found: Corrected, noise: np.ndarray) -> None:
     arm, n = found.arm, found.arm.dof
-    named = {name: np.asarray(getattr(arm, name)) for name in _ARM_FIELDS} | {
+    named = {name: np.asarray(getattr(arm, name)) for name in NUMBERS} | {
         "change": np.asarray(found.change),
         "damping_change": np.asarray(found.damping_change),
         "frictionloss_change": np.asarray(found.frictionloss_change),
@@ -438,16 +426,3 @@ def _tupled(value: Any) -> Any:
         if isinstance(value, Sequence) and not isinstance(value, str)
         else value
     )
-
-
-def _numbers(values: Array) -> list[Any]:
-    """As lists; infinite limits become null."""
-    array = np.asarray(values)
-    return (
-        array.tolist() if np.isfinite(array).all() else [float(v) if np.isfinite(v) else None for v in array]
-    )
-
-
-def _from_numbers(values: Sequence[Any], name: str) -> Sequence[Any]:
-    missing = -np.inf if name == "lower" else np.inf
-    return [missing if v is None else v for v in values]

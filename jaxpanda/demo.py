@@ -120,8 +120,6 @@ def demonstrate(
         with progress("random starts") as tick:
             links = retrieve(
                 found,
-                arm=None if model is None else arm,
-                weighting="torque",
                 starts=starts,
                 seed=seed,
                 progress=tick,

@@ -595,6 +595,7 @@ def _arm(model, links, chain: Chain, standard: np.ndarray, name: str) -> Arm:
     joints = [link.joint_id for link in links]
     dofs = [link.dof for link in links]
     limited = model.jnt_limited[joints].astype(bool)
+    lumped = np.stack([link.lumped_standard for link in links])
 
     def unless(flag: str, values: np.ndarray):
         return jnp.asarray(np.zeros(len(links)) if _disabled(model, flag) else values)
@@ -612,6 +613,7 @@ def _arm(model, links, chain: Chain, standard: np.ndarray, name: str) -> Arm:
         joint_names=tuple(link.joint for link in links),
         link_names=tuple(link.body for link in links),
         name=name,
+        lumped=jnp.asarray(lumped) if np.any(lumped) else None,
     )
 
 

@@ -19,6 +19,13 @@ def published() -> dict[str, Any]:
     return json.loads(resources.files("jaxpanda").joinpath("published/gaz2019.json").read_text("utf-8"))
 
 
+def is_panda(arm: Arm) -> bool:
+    """Whether an arm is the project's own Panda, and not another model of that name."""
+    own = panda()
+    pairs = ((arm.chain.R, own.chain.R), (arm.chain.p, own.chain.p), (arm.standard, own.standard))
+    return all(np.array_equal(a, b) for a, b in pairs)
+
+
 def panda() -> Arm:
     """The Panda without hand: modified Denavit-Hartenberg table and retrieved parameters of Gaz et al.
 

@@ -92,6 +92,7 @@ def identify_files(
                     folds=folds,
                     progress=tick,
                 )
+        found = dataclasses.replace(found, model_file="" if model is None else str(model.resolve()))
         found.save(folder)
     return found
 
@@ -102,7 +103,7 @@ def retrieve_files(
     bounds: Path | None,
     model: Path | None,
     *,
-    weighting: Literal["none", "torque"],
+    weighting: Literal["auto", "torque", "none"],
     starts: int,
     seed: int,
 ) -> Retrieval | None:
@@ -174,12 +175,14 @@ def to_mjcf(links: Retrieval, out: str | Path, model: str | Path | None = None) 
     Args:
         links: what `retrieve` found.
         out: the file to write.
-        model: the user's own MJCF, of which only the parameters change; the project's Panda without it.
+        model: the user's own MJCF, of which only the parameters change. Without it the one that was identified,
+            where that was read from a file by `identify_files`; else the project's Panda.
 
     Raises:
-        InputError: the model holds another arm, or cannot hold the parameters.
+        InputError: the model holds another arm, cannot hold the parameters, or is not there any more.
     """
     out = Path(out)
+    model = model or _identified_file(links)
     own = model is None
     arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", out)) if own else from_mjcf(model)
     if links.dof != arm.dof:
@@ -192,11 +195,26 @@ def to_mjcf(links: Retrieval, out: str | Path, model: str | Path | None = None) 
     return Export(out, () if own else written.changes, (*written.warnings, *written.save(out)))
 
 
-def validate_files(out: Path, model: Path, recordings: Sequence[Path], *, cutoff: float) -> Validation:
+def _identified_file(links: Retrieval) -> Path | None:
+    """The MJCF to export into where none is given; None for the project's own Panda."""
+    if not links.model_file:
+        if links.arm not in ("", "panda"):
+            raise InputError(
+                f"export: the links are those of the arm '{links.arm}'; give its MJCF by --model"
+            )
+        return None
+    if not (model := Path(links.model_file)).is_file():
+        raise InputError(f"{model}: the MJCF that was identified is not there any more; give it by --model")
+    return model
+
+
+def validate_files(
+    out: Path, model: Path, recordings: Sequence[Path], *, cutoff: float, in_mjx: bool = True
+) -> Validation:
     """`jaxpanda validate`: with the offset in an exported file's sidecar, and what the lint has to say."""
     with output_folder(out) as folder:
         friction, beside = beyond_mjcf(model)
-        checked = validate(model, recordings_of(recordings), cutoff=cutoff, friction=friction)
+        checked = validate(model, recordings_of(recordings), cutoff=cutoff, in_mjx=in_mjx, friction=friction)
         slips = tuple(f"{slip.severity}: {slip.where}: {slip.message}" for slip in lint(model))
         checked = dataclasses.replace(checked, notes=(*checked.notes, *beside, *slips))
         checked.save(folder)

@@ -78,17 +78,24 @@ def number(value: float | int | None, digits: int = 4) -> str:
     return "–" if value is None else f"{value:.{digits}g}"
 
 
-def to_terminal(sections: Sequence[Section]) -> None:
-    """Print sections on standard output, without their figures."""
+def to_terminal(sections: Sequence[Section], width: int | None = None) -> None:
+    """Print sections on standard output, without their figures.
+
+    Args:
+        sections: what to print.
+        width: of the lines, between whose words sentences are broken; without it that of the terminal, and on a
+            file or pipe a sentence is a line.
+    """
     import rich.table
     from rich.console import Console
     from rich.markup import escape
 
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else _PIPED_WIDTH)
+    wrapped = width is not None or sys.stdout.isatty()
+    console = Console(highlight=False, width=width if wrapped else _PIPED_WIDTH)
     for section in sections:
         console.print(f"\n[bold]{escape(section.heading)}[/bold]")
         for sentence in section.sentences:
-            console.print(escape(sentence), soft_wrap=True)
+            console.print(escape(sentence), soft_wrap=not wrapped)
         for table in section.tables:
             drawn = rich.table.Table(title=escape(table.caption) or None, title_justify="left")
             for i, column in enumerate(table.columns):

@@ -19,11 +19,15 @@ from .certificate import lower_bound
 from .errors import InputError
 from .feasible import Bounds, Constraint, Links, Solutions, exact_penalty, solve
 from .feasible.bounds import INERTIA
+from .feasible.buildable import doubts, reach
+from .feasible.constraints import less_lumped
+from .feasible.nearest import are_buildable
 from .feasible.schedule import Device
 from .feasible.solver import NOTHING, STARTS
 from .files import finite, output_folder, read_json, to_json
 from .friction import Friction
 from .identification import Identification
+from .identification.condensed import Evidence, least_friction, own_parameters, with_own_parameters
 from .identification.result import known_physics
 from .panda import panda
 from .parameters import coefficient_matrix
@@ -36,6 +40,9 @@ AS_GOOD = 1.01
 """A solution is as good as the best where its objective is within this factor of it."""
 CONCESSION = 5e-4
 """Share of the objective that may be given up to stay near the nominal parameters."""
+TORQUE_CONCESSION = 0.01
+"""Share by which the torque error may grow for the same, where recordings were identified. On motion that was
+not fitted that of the real Panda's links is lower for it: the model knows better what torque hardly tells."""
 ACTIVE = 1e-5
 """A constraint is active where its margin is below this share of its box (triangle inequality: [kg m²])."""
 _BLOCK = 16384  # starts described at once
@@ -71,9 +78,20 @@ class Retrieval:
     link_names: tuple[str, ...]
     arm: str = ""
     friction: Friction | None = None
-    """As identified; carried along for the export."""
+    """For the export: as identified or, under the weighting "torque", as it serves these links best, none of it
+    negative."""
     known: Mapping[str, Float[np.ndarray, " dof"]] = dataclasses.field(default_factory=dict)
     """What the model that was identified held beyond rigid links; carried along too."""
+    model_file: str = ""
+    """The MJCF that was identified, where that is known."""
+    rmse: Float[np.ndarray, " dof"] | None = None
+    """What these links and this friction leave of the torque that they were identified from [N m]."""
+    relative_error_percent: float | None = None
+    cross_validated_rmse: Float[np.ndarray, " dof"] | None = None
+    """The same on blocks of it of which links and friction were found without them."""
+    cross_validated_relative_error_percent: float | None = None
+    warnings: tuple[str, ...] = ()
+    """Links that nobody would build, each with its reason."""
     notes: tuple[str, ...] = ()
     """What the user should know before relying on this."""
     solutions: Solutions | None = None
@@ -112,6 +130,14 @@ class Retrieval:
             "as_good": self.as_good,
             "spread": {name: list(pair) for name, pair in self.spread.items()},
             "weighting": self.weighting,
+            "model_file": self.model_file or None,
+            "rmse": [] if self.rmse is None else self.rmse.tolist(),
+            "relative_error_percent": self.relative_error_percent,
+            "cross_validated_rmse": (
+                [] if self.cross_validated_rmse is None else self.cross_validated_rmse.tolist()
+            ),
+            "cross_validated_relative_error_percent": self.cross_validated_relative_error_percent,
+            "warnings": list(self.warnings),
             "penalty": self.penalty,
             "seconds": {"compile": self.compile_seconds, "run": self.run_seconds},
             "notes": list(self.notes),
@@ -158,6 +184,12 @@ class Retrieval:
                 arm=document["arm"],
                 friction=Friction.from_json(document["friction"]) if document["friction"] else None,
                 known=known_physics(document["known"], len(document["links"]), str(file)),
+                model_file=document.get("model_file") or "",
+                rmse=_array(document.get("rmse")),
+                relative_error_percent=document.get("relative_error_percent"),
+                cross_validated_rmse=_array(document.get("cross_validated_rmse")),
+                cross_validated_relative_error_percent=document.get("cross_validated_relative_error_percent"),
+                warnings=tuple(document.get("warnings", ())),
                 notes=tuple(document["notes"]),
                 solutions=_load_starts(file.with_name(STARTS_FILE)),
             )
@@ -173,7 +205,7 @@ def retrieve(
     bounds: Bounds | str | Path | None = None,
     arm: Arm | None = None,
     constraints: Sequence[Constraint] = (),
-    weighting: Literal["none", "torque"] = "none",
+    weighting: Literal["auto", "torque", "none"] = "auto",
     penalty: Literal["smooth", "exact"] = "smooth",
     prefer: Literal["best", "nominal"] = "nominal",
     starts: int = STARTS,
@@ -190,17 +222,21 @@ def retrieve(
 
     Args:
         identification: a result, a table with the field `coefficients`, or the file that holds either.
-        bounds: boxes on the links' parameters, or their table. Without them: around `arm` where one is given,
-            the published ones for a Panda.
-        arm: whose nominal parameters to set bounds around, and to stay near to under `prefer="nominal"`.
+        bounds: boxes on the links' parameters, or their table. Without them: the published ones for the
+            project's Panda, around `arm` for any other.
+        arm: whose nominal parameters to set bounds around, and to stay near to under `prefer="nominal"`. Without
+            it, the arm that was identified; of a bare table of coefficients, the Panda.
         constraints: further ones, as functions of `Links` that return margins.
-        weighting: "none" as in the paper, on the reliable coefficients; "torque" weighs every direction of
-            all coefficients by the torque it moved in the data, so that the links lose as little of the fit as
-            they can.
+        weighting: "torque" weighs every direction of all coefficients by the torque it moved in the data, so that
+            the links lose as little of the fit as they can; "none", as in the paper, takes the reliable
+            coefficients alike and leaves out the others. "auto" is "torque" where motion and torque were
+            identified, of which most coefficients are not reliable one by one, and "none" for M(q) and g(q),
+            which show each of them, and for a bare table.
         penalty: "smooth" is `feasible.solve`; "exact" is the paper's Algorithm 1, for comparison.
-        prefer: "best", the lowest objective; "nominal", near to the nominal parameters (of `arm`, else the
-            Panda's) in all that the coefficients do not tell, at an objective no more than `CONCESSION` higher
-            ("smooth" penalty only).
+        prefer: "best", the lowest objective; "nominal", near to the nominal parameters (of `arm`) in all that
+            the coefficients do not tell, at an objective no more than `CONCESSION` higher or, under "torque"
+            and where recordings were identified, a torque error about `TORQUE_CONCESSION` higher ("smooth"
+            penalty only).
         starts: random starts.
         seed: same seed, same answer.
         certificate: lower bound by convex optimisation; "auto" where the extra [sdp] is installed.
@@ -215,7 +251,10 @@ def retrieve(
         MissingExtraError: `certificate=True` without the extra [sdp].
     """
     table = _identified(identification)
+    arm = arm or _arm(table)
     boxes = _bounds(bounds, arm, table)
+    if weighting == "auto":
+        weighting = "torque" if table.method in ("trajectory", "one_step") else "none"
     A, b = _equations(table, boxes.dof, weighting)
     constraints = tuple(constraints)
     run = {"smooth": partial(solve, devices=devices, checkpoint=checkpoint), "exact": exact_penalty}[penalty]
@@ -230,14 +269,45 @@ def retrieve(
     as_good = feasible & (found.objective <= max(AS_GOOD * best, NOTHING * float(b @ b)))
     as_good[found.best] = True
     phi, violation = found.phi[found.best], float(found.violation[found.best])
-    nominal = _nominal(arm, table)
-    if prefer == "nominal" and penalty == "smooth" and nominal is not None and feasible.any():
-        phi, violation = _towards(nominal, A, b, boxes, constraints, phi), 0.0
+    nominal = None if arm is None else np.asarray(arm.standard)
+    notes = _notes(table, found, weighting)
+    held, carrying = constraints, arm is not None and arm.lumped is not None
+    if nominal is not None and feasible.any() and penalty == "smooth" and (prefer == "nominal" or carrying):
+        room = CONCESSION * best + NOTHING * float(b @ b)
+        if weighting == "torque" and table.evidence is not None and table.method == "trajectory":
+            room += _conceded(table.evidence.whole.dof * table.evidence.whole.samples + best)
+        pulled = _towards(nominal, A, b, boxes, constraints, phi, room)
+        if arm is not None and carrying and not are_buildable(pulled - np.asarray(arm.lumped)):
+            further = (*constraints, less_lumped(np.asarray(arm.lumped)))
+            beside = _pulled(nominal, A, b, boxes, further, nominal, room)
+            if beside.violation[beside.best] == 0:
+                pulled, held = beside.phi[beside.best], further
+            else:
+                notes.append(
+                    "links that explain the torque leave no room for the bodies that the model fixes to them;"
+                    " does the recorded arm carry those?"
+                )
+        if prefer == "nominal" or held is not constraints:
+            phi, violation = pulled, 0.0
+            if room > 2 * CONCESSION * best:
+                notes.append(
+                    f"the torque error may be {100 * TORQUE_CONCESSION:g} % higher than it need be, for"
+                    " links nearer to the model's"
+                )
+    if prefer != "nominal" or penalty != "smooth":
+        nominal = None
     wanted = certificate is True or (
         certificate == "auto" and importlib.util.find_spec("clarabel") is not None
     )
     margins = _margins(phi, boxes, constraints)
     names = table.link_names if len(table.link_names) == boxes.dof else ()
+    names = names or tuple(f"link{i + 1}" for i in range(boxes.dof))
+    friction, errors = table.friction, {}
+    if table.evidence is not None:
+        if weighting == "torque" and friction is not None:
+            own = table.evidence.whole.following(table.projection @ phi.ravel(), least_friction(friction))
+            friction = with_own_parameters(friction, own)
+        errors = _torque_errors(table, table.evidence, friction, boxes, held, phi, weighting, nominal)
     return Retrieval(
         standard=phi,
         objective=float(np.sum((A @ phi.ravel() - b) ** 2)),
@@ -253,11 +323,14 @@ def retrieve(
         penalty=penalty,
         compile_seconds=found.compile_seconds,
         run_seconds=found.run_seconds,
-        link_names=names or tuple(f"link{i + 1}" for i in range(boxes.dof)),
+        link_names=names,
         arm=table.arm,
-        friction=table.friction,
+        friction=friction,
         known=table.known,
-        notes=tuple(_notes(table, found)),
+        model_file=table.model_file,
+        **errors,
+        warnings=tuple(doubts(phi, names, None if arm is None else reach(arm))),
+        notes=tuple(notes),
         solutions=found,
     )
 
@@ -270,20 +343,25 @@ def _identified(identification: Identification | Mapping[str, Any] | str | Path)
     return Identification.load(identification)
 
 
+def _arm(table: Identification) -> Arm | None:
+    """The arm that was identified; the Panda where nothing says otherwise."""
+    return table.model or (panda() if table.arm in ("", "panda") and table.dof <= 7 else None)
+
+
 def _bounds(bounds: Bounds | str | Path | None, arm: Arm | None, table: Identification) -> Bounds:
     if bounds is None:
-        if arm is not None:
-            chosen = Bounds.around(arm)
-        elif table.arm in ("", "panda"):
-            chosen = Bounds.panda()
-        else:
+        if arm is None:
+            whose = f"the arm '{table.arm}'" if table.arm else f"an arm of {table.dof} links"
             raise InputError(
-                f"bounds: none are known for the arm '{table.arm}'; give a table of bounds or the model"
+                f"bounds: none are known for {whose}; give its MJCF by --model, or a table of bounds by --bounds"
             )
+        chosen = Bounds.of(arm)
     else:
         chosen = bounds if isinstance(bounds, Bounds) else Bounds.from_csv(bounds)
     if chosen.dof < table.dof:
-        whose = "of the Panda, taken as no others were given, " if bounds is None and arm is None else ""
+        whose = (
+            "of the Panda, taken as no others were given, " if bounds is None and table.model is None else ""
+        )
         raise InputError(f"bounds: {whose}cover {chosen.dof} links, the coefficients name link {table.dof}")
     return chosen
 
@@ -309,13 +387,6 @@ def _equations(
     return root.T @ A, root.T @ b
 
 
-def _nominal(arm: Arm | None, table: Identification) -> Float[np.ndarray, "dof 10"] | None:
-    """What the links were thought to be, where that is known."""
-    if arm is None and table.arm in ("", "panda") and table.dof == 7:
-        arm = panda()
-    return None if arm is None else np.asarray(arm.standard)
-
-
 def _towards(
     nominal: Float[np.ndarray, "dof 10"],
     A: Float[np.ndarray, "rows columns"],
@@ -323,34 +394,111 @@ def _towards(
     bounds: Bounds,
     constraints: tuple[Constraint, ...],
     best: Float[np.ndarray, "dof 10"],
+    room: float,
 ) -> Float[np.ndarray, "dof 10"]:
-    r"""Links nearer to the nominal ones that meet the coefficients as well as `best`.
+    r"""Links nearer to the nominal ones that meet the coefficients as well as `best`, but for `room`.
 
     Minimises $\lVert A\phi - b\rVert^2 + \epsilon R(\phi)$ from `best`, R the squared distance from nominal as
     shares of a link's size. Its minimum has an objective of at most $\phi_{best} + \epsilon R(\phi_{best})$, and
-    $\epsilon$ is what makes this `CONCESSION` higher: only what the coefficients leave open moves.
+    $\epsilon$ is what makes this `room` higher: only what the coefficients leave open moves.
     """
-    mass = np.maximum(nominal[:, :1], 0.1 * nominal[:, 0].mean())
-    size = np.linalg.norm(np.diff(bounds.com)[..., 0], axis=-1)[:, None]
-    scale = np.concatenate([mass, *[mass * size] * 3, *[mass * size**2] * 6], 1)
-    distance = lambda phi: float(np.sum(((phi - nominal) / scale) ** 2))
     objective = lambda phi: float(np.sum((A @ phi.ravel() - b) ** 2))
-    room = CONCESSION * objective(best) + NOTHING * float(b @ b)
-    root = np.sqrt(room / max(distance(best), 1e-300))
-    pulled = solve(
-        np.concatenate([A, np.diag(root / scale.ravel())]),
-        np.concatenate([b, root * (nominal / scale).ravel()]),
-        bounds,
-        constraints=constraints,
-        initial=np.stack([best, nominal]),
-        starts=2,
-    )
+    scale = _scale(nominal, bounds)
+    distance = lambda phi: float(np.sum(((phi - nominal) / scale) ** 2))
+    pulled = _pulled(nominal, A, b, bounds, constraints, best, room)
     nearer = (
         (pulled.violation == 0)
         & np.array([objective(phi) <= objective(best) + room for phi in pulled.phi])
         & np.array([distance(phi) < distance(best) for phi in pulled.phi])
     )
     return pulled.phi[np.argmin(np.where(nearer, pulled.objective, np.inf))] if nearer.any() else best
+
+
+def _conceded(squares: float) -> float:
+    """By how much squares may grow for their root to grow by `TORQUE_CONCESSION`."""
+    return 2 * TORQUE_CONCESSION * squares
+
+
+def _scale(nominal: Float[np.ndarray, "dof 10"], bounds: Bounds) -> Float[np.ndarray, "dof 10"]:
+    """In which distances from the nominal links count."""
+    mass = np.maximum(nominal[:, :1], 0.1 * nominal[:, 0].mean())
+    size = np.linalg.norm(np.diff(bounds.com)[..., 0], axis=-1)[:, None]
+    return np.concatenate([mass, *[mass * size] * 3, *[mass * size**2] * 6], 1)
+
+
+def _pulled(
+    nominal: Float[np.ndarray, "dof 10"],
+    A: Float[np.ndarray, "rows columns"],
+    b: Float[np.ndarray, " rows"],
+    bounds: Bounds,
+    constraints: tuple[Constraint, ...],
+    first: Float[np.ndarray, "dof 10"],
+    room: float,
+) -> Solutions:
+    """From `first`, with a pull towards the nominal links that costs no more than `room` there."""
+    scale = _scale(nominal, bounds)
+    root = np.sqrt(room / max(float(np.sum(((first - nominal) / scale) ** 2)), 1e-300))
+    return solve(
+        np.concatenate([A, np.diag(root / scale.ravel())]),
+        np.concatenate([b, root * (nominal / scale).ravel()]),
+        bounds,
+        constraints=constraints,
+        initial=np.stack([first, nominal]),
+        starts=2,
+    )
+
+
+def _torque_errors(
+    table: Identification,
+    evidence: Evidence,
+    friction: Friction | None,
+    bounds: Bounds,
+    constraints: tuple[Constraint, ...],
+    phi: Float[np.ndarray, "dof 10"],
+    weighting: str,
+    nominal: Float[np.ndarray, "dof 10"] | None,
+) -> dict[str, Any]:
+    """What links and friction leave of the torque, and what they do on blocks that they were found without.
+
+    The latter for links found by the torque of recordings only: which coefficients are reliable is not known
+    block by block, and what `one_step` expects of links is not known here.
+    """
+    whole, K = evidence.whole, table.projection
+    beta = K @ phi.ravel()
+    left = whole.residual(beta, own_parameters(friction, whole.dof))
+    errors: dict[str, Any] = {
+        "rmse": left / np.sqrt(whole.samples),
+        "relative_error_percent": _percent(left, whole.torque),
+    }
+    if weighting != "torque" or table.method != "trajectory" or not evidence.folds:
+        return errors
+    squares, least = np.zeros(whole.dof), least_friction(friction)
+    for train, test in evidence.folds:
+        estimate, own, sigma = train.classical(len(beta), str(table.settings.get("weighting", "joint")))
+        T = train.weigh(len(beta), sigma)
+        A, b = T @ K, T @ estimate
+        nothing = NOTHING * float(b @ b)
+        found = _pulled(phi if nominal is None else nominal, A, b, bounds, constraints, phi, nothing)
+        links = found.phi[found.best]
+        if nominal is not None:
+            left = train.residual(estimate, own) / sigma
+            room = _conceded(float(left @ left) + float(np.sum((A @ links.ravel() - b) ** 2)))
+            links = _towards(nominal, A, b, bounds, constraints, links, room)
+        squares += test.residual(K @ links.ravel(), train.following(K @ links.ravel(), least)) ** 2
+    samples = sum(test.samples for _, test in evidence.folds)
+    torque = float(np.linalg.norm([test.torque for _, test in evidence.folds]))
+    return errors | {
+        "cross_validated_rmse": np.sqrt(squares / samples),
+        "cross_validated_relative_error_percent": _percent(np.sqrt(squares), torque),
+    }
+
+
+def _percent(left: Float[np.ndarray, " dof"], torque: float) -> float:
+    return 100 * float(np.linalg.norm(left)) / torque if torque else 0.0
+
+
+def _array(values: Any) -> np.ndarray | None:
+    return np.array(values, float) if values else None
 
 
 _to_com = jax.jit(jax.vmap(inertia.to_com))
@@ -433,8 +581,8 @@ def _active(margins: Mapping[str, Any], bounds: Bounds) -> list[str]:
     return found + [f"constraint {i}" for i, ms in user if any(m is not None and m <= ACTIVE for m in ms)]
 
 
-def _notes(table: Identification, found: Solutions) -> list[str]:
-    discarded = int(np.sum(~table.reliable))
+def _notes(table: Identification, found: Solutions, weighting: str) -> list[str]:
+    discarded = int(np.sum(~table.reliable)) if weighting == "none" else 0
     stalled = int(np.sum((found.violation == 0) & ~found.converged))
     infeasible = int(np.sum(found.violation > 0))
     said = [

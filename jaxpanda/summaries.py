@@ -1,5 +1,6 @@
 """Every stage's result in sentences, tables and figures: once, for the terminal and for the page."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -84,10 +85,11 @@ def retrieval(links: Any) -> Sequence[Section]:
     document = links.to_json()
     best = document["objective"]
     sentences = [
+        *_explained(document),
         f"The best of {document['starts']} random starts misses the coefficients by phi = {best:.6g}"
         f"{' (weighed by torque, in variances of a sample)' if document['weighting'] == 'torque' else ''}; "
         f"largest violation of any constraint {document['max_violation']:.2g}; "
-        f"total mass {document['total_mass']:.2f} kg."
+        f"total mass {document['total_mass']:.2f} kg.",
     ]
     if document["lower_bound"] is not None:
         sentences.append(
@@ -110,6 +112,8 @@ def retrieval(links: Any) -> Sequence[Section]:
         f"{document['as_good']} starts are as good as the best (within 1 %). What differs between them is what "
         "torque cannot tell: do not read a single mass as measured. The complete list stands in retrieval.json."
     )
+    sentences += [f"Nobody would build this: {what}." for what in document["warnings"]]
+    sentences += document["notes"]
     figures = []
     if links.solutions is not None:
         figures.append(outcome_figure(links.solutions.objective, document["lower_bound"]))
@@ -125,10 +129,35 @@ def retrieval(links: Any) -> Sequence[Section]:
                     "In each link's modified Denavit-Hartenberg frame; inertia about the com [kg m²]",
                 ),
                 Table(["mass", "least kg", "most kg"], open_, "Over the starts that are as good as the best"),
+                *_errors(document),
             ],
             figures,
         )
     ]
+
+
+def _explained(document: Mapping[str, Any]) -> list[str]:
+    """How much of the recorded torque the links leave."""
+    if document["relative_error_percent"] is None:
+        return []
+    unseen = document["cross_validated_relative_error_percent"]
+    return [
+        "Of the torque that they were identified from, these links and their friction leave "
+        f"{number(document['relative_error_percent'])} % unexplained"
+        + (
+            "."
+            if unseen is None
+            else f"; links found without a block of it, {number(unseen)} % of that block."
+        )
+    ]
+
+
+def _errors(document: Mapping[str, Any]) -> list[Table]:
+    columns = {"fitted": document["rmse"], "held out": document["cross_validated_rmse"]}
+    names = [link["name"] for link in document["links"]]
+    return (
+        [by_joint("Torque error at the joint of each link [N m]", names, columns)] if document["rmse"] else []
+    )
 
 
 def export(written: Any) -> Sequence[Section]:
@@ -139,8 +168,8 @@ def export(written: Any) -> Sequence[Section]:
             f"{change.file}:{change.line}",
             change.element,
             change.attribute,
-            change.old or "–",
-            change.new or "–",
+            _short(change.old) or "–",
+            _short(change.new) or "–",
         ]
         for change in written.changes
     ]
@@ -148,19 +177,28 @@ def export(written: Any) -> Sequence[Section]:
     return [Section("Export", sentences, tables)]
 
 
+def _short(value: str | None) -> str | None:
+    """The numbers of an attribute with six digits; the file holds them whole."""
+    if value is None:
+        return None
+    return re.sub(r"-?\d+\.\d+(?:[eE][-+]?\d+)?", lambda found: f"{float(found[0]):.6g}", value)
+
+
 def validation(checked: Any) -> Sequence[Section]:
     """Agreement of three inverse dynamics, torque error and tracking."""
     document = checked.to_json()
+    apart = f"kernel against MuJoCo {number(document['kernel_vs_mujoco'], 2)} N m"
+    if document["mjx_vs_mujoco"] is not None:
+        apart += f", MJX against MuJoCo {number(document['mjx_vs_mujoco'], 2)} N m"
     sentences = [
-        "Largest difference of inverse dynamics on the recorded states: kernel against MuJoCo "
-        f"{number(document['kernel_vs_mujoco'], 2)} N m, MJX against MuJoCo "
-        f"{number(document['mjx_vs_mujoco'], 2)} N m.",
+        f"Largest difference of inverse dynamics on the recorded states: {apart}.",
         f"Torque error on the recording: {number(document['relative_error_percent'])} %.",
         *document.get("notes", []),
     ]
     columns: dict[str, Any] = {"torque rmse [N m]": document["rmse"]}
-    if document.get("rollout_rmse_rad"):
-        columns["tracking in MJX, rmse [rad]"] = document["rollout_rmse_rad"]
+    for engine, name in (("mjx", "MJX"), ("mujoco", "MuJoCo")):
+        if document["rollout"][engine] is not None:
+            columns[f"tracking in {name}, rmse [rad]"] = document["rollout"][engine]["rmse_rad"]
     names = document.get("joints") or [f"joint {i + 1}" for i in range(len(document["rmse"]))]
     figures = [
         torque_figure(

@@ -16,6 +16,7 @@ model; `feedback_rms`, the torque that feedback had to add, is the model's error
 import contextlib
 import copy
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -167,6 +168,7 @@ def validate(
     *,
     cutoff: float = 5.0,
     rollout: bool = True,
+    in_mjx: bool = True,
     friction: Friction | None = None,
 ) -> Validation:
     """Check an MJCF in MuJoCo and MJX, and against recordings.
@@ -176,6 +178,7 @@ def validate(
         recordings: of that arm, with torque; best such as the model was not fitted to.
         cutoff: of the zero-phase low-pass on both sides of the torque [Hz].
         rollout: whether to run the model forward too.
+        in_mjx: whether to ask MJX as well, which on a CPU takes most of the time.
         friction: of the joints beyond what the file holds (what MJCF has no place for: an offset, a
             sigmoid); counts in `rmse` and in the roll-out, where it acts as an external torque.
 
@@ -189,15 +192,15 @@ def validate(
     if not motions:
         raise InputError(f"{model}: nothing to validate against; give at least one recording")
     bare = arm_model(source)
-    mjx, notes = mjx_package(source.model)
+    mjx, notes = mjx_package(source.model) if in_mjx else (None, ["not checked in MJX, as asked"])
     notes = [*source.notes, *notes]
 
     states = _states(motions)
     reference = _mujoco_inverse(source, *states)
     kernel = _difference(_kernel_inverse(arm, *states), reference)
-    in_mjx = None if mjx is None else _difference(_mjx_inverse(mjx, bare, *states), reference)
+    jax_apart = None if mjx is None else _difference(_mjx_inverse(mjx, bare, *states), reference)
     limit = AGREEMENT * max(1.0, float(np.abs(reference).max()))
-    agree = max(kernel, in_mjx or 0.0) <= limit
+    agree = max(kernel, jax_apart or 0.0) <= limit
     if not agree:
         notes.append(
             f"inverse dynamics differs between engines by more than {limit:.1e} N m: trust none of them here"
@@ -222,7 +225,7 @@ def validate(
         joints=arm.joint_names,
         cutoff=cutoff,
         kernel_vs_mujoco=kernel,
-        mjx_vs_mujoco=in_mjx,
+        mjx_vs_mujoco=jax_apart,
         agree=agree,
         rmse=_rms(errors),
         relative_error_percent=_relative(errors, measured),
@@ -338,6 +341,7 @@ def _copy_options(full: mujoco.MjModel, bare: mujoco.MjModel) -> None:
     bare.opt.integrator = integrator if integrator in runs_in_mjx else kinds.mjINT_IMPLICITFAST
     bare.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     off = mujoco.mjtDisableBit
+    bare.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # MuJoCo 4.0.0 factorises a sparse one wrongly
     bare.opt.disableflags = full.opt.disableflags | off.mjDSBL_CONTACT | off.mjDSBL_ACTUATION
 
 
@@ -442,14 +446,17 @@ def jit_mjx(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _mjx_inverse(mjx: Any, bare: mujoco.MjModel, q, qd, qdd) -> Float[np.ndarray, "time dof"]:
     model = mjx.put_model(_smooth(bare))
-    blank = mjx.make_data(model)
+    return np.asarray(_mjx_torque(mjx)(model, mjx.make_data(model), *map(jnp.asarray, (q, qd, qdd))))
 
-    @jit_mjx
-    @jax.vmap
-    def torque(q, qd, qdd):
+
+@functools.cache
+def _mjx_torque(mjx: Any) -> Callable[..., Any]:
+    """Inverse dynamics of many states, for any model of a kind."""
+
+    def torque(model: Any, blank: Any, q: Array, qd: Array, qdd: Array) -> Array:
         return mjx.inverse(model, blank.replace(qpos=q, qvel=qd, qacc=qdd)).qfrc_inverse
 
-    return np.asarray(torque(*map(jnp.asarray, (q, qd, qdd))))
+    return jit_mjx(jax.vmap(torque, in_axes=(None, None, 0, 0, 0)))
 
 
 def _torque_error(arm: Arm, friction: Friction | None, signals: Signals) -> TorqueError:
@@ -545,8 +552,16 @@ def _rollout_mujoco(bare: mujoco.MjModel, tasks: Sequence[_Task], law: _Feedback
     return _result(motions, feedback, tasks, time.perf_counter() - start)
 
 
+_CHUNK = 1000
+"""Steps of MJX that are compiled as one, so that what was compiled serves motions of any length."""
+
+
 def _rollout_mjx(mjx: Any, bare: mujoco.MjModel, tasks: Sequence[_Task], law: _Feedback) -> Rollout | None:
-    """The same in MJX, as one scan over all steps."""
+    """The same in MJX, compiled once for all recordings.
+
+    The model's numbers are constants of what is compiled: as arguments they make a step three times as long, and
+    steps of several roll-outs at once are longer still.
+    """
     start = time.perf_counter()
     model = mjx.put_model(bare)
     blank = mjx.make_data(model)
@@ -558,19 +573,22 @@ def _rollout_mjx(mjx: Any, bare: mujoco.MjModel, tasks: Sequence[_Task], law: _F
         return mjx.step(model, data.replace(qfrc_applied=applied)), (data.qpos, added)
 
     @jit_mjx
-    def run(q, qd, tau):
-        return jax.lax.scan(step, blank.replace(qpos=q[0], qvel=qd[0]), (q, qd, tau))[1]
+    def run(data, q, qd, tau):
+        return jax.lax.scan(step, data, (q, qd, tau))
 
-    # one compilation serves all: shorter motions are held at their end, and what comes after it is dropped
-    longest = max(len(task.q) for task in tasks)
+    # a motion is held at its end until a chunk is full, and what comes after it is dropped
+    hold = lambda x: jnp.asarray(np.pad(x, ((0, -len(x) % _CHUNK), (0, 0)), mode="edge"))
     motions, feedback = [], []
     for task in tasks:
-        padded = [
-            np.pad(x, ((0, longest - len(x)), (0, 0)), mode="edge") for x in (task.q, task.qd, task.tau)
-        ]
-        q, added = run(*map(jnp.asarray, padded))
-        motions.append(np.asarray(q)[: len(task.q)])
-        feedback.append(np.asarray(added)[: len(task.q)])
+        q, qd, tau = (hold(x) for x in (task.q, task.qd, task.tau))
+        data, parts = blank.replace(qpos=q[0], qvel=qd[0]), []
+        for first in range(0, len(q), _CHUNK):
+            here = slice(first, first + _CHUNK)
+            data, part = run(data, q[here], qd[here], tau[here])
+            parts.append(part)
+        moved, added = (np.concatenate(x)[: len(task.q)] for x in zip(*parts, strict=True))
+        motions.append(moved)
+        feedback.append(added)
     return _result(motions, feedback, tasks, time.perf_counter() - start)
 
 

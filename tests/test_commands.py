@@ -1,6 +1,7 @@
 """The commands: what they leave, what they print, and how they refuse."""
 
 import json
+import pickle
 import re
 import shutil
 import subprocess
@@ -220,3 +221,61 @@ def test_the_corrected_file_loads_though_the_user_s_includes_others(capsys, tmp_
     assert (tmp_path / "in" / "parts" / "arm.xml").read_bytes() == (MODELS / "parts" / "arm.xml").read_bytes()
     assert "parts/arm.xml" in (out / "report.html").read_text()
     assert jaxpanda.replay(out, log).rmse.max() < 0.1
+    loaded = jaxpanda.Corrected.load(out)
+    assert [effect.name for effect in loaded.effects] == ["viscous_friction"]
+    assert pickle.loads(pickle.dumps(loaded)).to_json() == loaded.to_json()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["inspekt"], "no command 'inspekt' (did you mean inspect?)"),
+        (["inspect", "--recordin", "a.csv"], "inspect has no option --recordin (did you mean --recording?)"),
+        (["retrieve", "--out", "x"], "retrieve needs --identification"),
+        (["demo", "--out", "d", "--starts", "many"], "--starts: 'many' is no whole number"),
+        (
+            ["retrieve", "--identification", "a", "--out", "b", "--weighting", "heavy"],
+            "--weighting heavy: is none of auto, torque, none",
+        ),
+    ],
+)
+def test_a_slip_of_the_keyboard_is_answered_with_what_was_meant(capsys, arguments, said):
+    line = refused(capsys, *arguments)
+    assert said in line
+    assert len(line) < 200
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"jaxpanda {jaxpanda.__version__}\n"
+    assert re.fullmatch(r"\d+\.\d+\.\d+.*", jaxpanda.__version__)
+
+
+def test_both_packages_tell_type_checkers_that_they_are_typed():
+    import jaxpanda_kernels
+
+    for package in (jaxpanda, jaxpanda_kernels):
+        assert (Path(package.__file__).parent / "py.typed").is_file()
+
+
+@pytest.mark.parametrize("width", [80, 100])
+def test_prose_is_broken_between_words(capsys, width):
+    from jaxpanda.report import Section, to_terminal
+
+    words = " ".join(f"word{i}" for i in range(60))
+    to_terminal([Section("Head", [words])], width=width)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= width
+    assert " ".join(line.strip() for line in lines[2:]).split() == words.split()
+
+
+def test_an_export_s_table_has_six_digits_and_its_json_all():
+    from jaxpanda.export import Change
+    from jaxpanda.pipeline import Export
+    from jaxpanda.summaries import of
+
+    change = Change("a.xml", 3, "inertial", "pos", "0.1 2 3", "0.12345678901234567 -1.2345678e-05 2")
+    written = Export(Path("a.xml"), (change,), ())
+    (row,) = of(written)[0].tables[0].rows
+    assert row[-1] == "0.123457 -1.23457e-05 2"
+    assert written.to_json()["changes"][0]["new"] == change.new

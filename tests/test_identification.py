@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -471,6 +472,12 @@ def test_an_identification_comes_back_from_its_file(found, tmp_path):
     for name in ("beta", "std", "reliable", "covariance", "rmse", "cross_validated_rmse"):
         assert np.array_equal(getattr(again, name), getattr(found, name)), name
     assert again.to_json() == found.to_json()
+
+
+def test_an_identification_can_be_pickled(found):
+    again = pickle.loads(pickle.dumps(found))
+    assert again.to_json() == found.to_json()
+    assert np.array_equal(again.evidence.whole.R, found.evidence.whole.R)
 
 
 def test_the_published_table_is_read_as_a_bare_table_of_coefficients(tmp_path):

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -91,6 +92,12 @@ def test_a_result_is_the_same_after_saving_and_loading(found, tmp_path):
     np.testing.assert_array_equal(loaded.standard, found.standard)
     np.testing.assert_array_equal(loaded.solutions.objective, found.solutions.objective)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["retrieval.json", "starts.npz"]
+
+
+def test_a_result_can_be_pickled(found):
+    again = pickle.loads(pickle.dumps(found))
+    assert again.to_json() == found.to_json()
+    np.testing.assert_array_equal(again.solutions.phi, found.solutions.phi)
 
 
 @pytest.fixture(scope="module")

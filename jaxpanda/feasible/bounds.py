@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from ..arm import Arm
 from ..errors import InputError
+from ..panda import is_panda
 
 INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
 """Order of the six entries of an inertia tensor in tables and files."""
@@ -82,6 +83,11 @@ class Bounds:
         with resources.as_file(resources.files("jaxpanda").joinpath("published/gaz2019_bounds.csv")) as path:
             boxes = cls.from_csv(path)
         return dataclasses.replace(boxes, total_mass=np.array([16.0, 20.0]))
+
+    @classmethod
+    def of(cls, arm: Arm) -> "Bounds":
+        """The published ones for the project's own Panda, `around` any other arm."""
+        return cls.panda() if is_panda(arm) else cls.around(arm)
 
     @classmethod
     def from_csv(cls, path: str | Path) -> "Bounds":

@@ -246,6 +246,7 @@ def identify_mass_gravity(
         cross_validated_relative_error_percent=None if held_out is None else _percent(held_out, y),
         known=of_model(arm),
         arm=arm.name,
+        model=arm,
         link_names=arm.link_names,
         joint_names=arm.joint_names,
         recordings=(samples.name,),

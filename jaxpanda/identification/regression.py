@@ -48,8 +48,6 @@ class Regression:
     """Measured torque [N m]: what relative errors are relative to."""
     duration: float
     """[s]"""
-    duration: float
-    """[s]"""
 
     def residual(self, x: Float[np.ndarray, " columns"]) -> Float[np.ndarray, "dof time"]:
         """What the unknowns `x` leave of the torque [N m]."""
@@ -192,8 +190,11 @@ def least_squares(regressions: Sequence[Regression], masks: Masks, weighting: st
 
     With the weighting `joint`, $\sigma_j$ is joint j's rms residual in the fit before; with `none` it is one.
     """
-    R = triangles(regressions, masks)
-    samples = sum(int(mask.sum()) for mask in masks)
+    return weighted_fit(triangles(regressions, masks), sum(int(mask.sum()) for mask in masks), weighting)
+
+
+def weighted_fit(R: Float[np.ndarray, "dof rows columns"], samples: int, weighting: str) -> Fit:
+    """`least_squares` from the joints' triangles of so many samples."""
     least = _LEAST_SIGMA * np.linalg.norm(R[:, :, -1]) / np.sqrt(R.shape[0] * samples) + np.finfo(float).tiny
     sigma = np.ones(len(R))
     x = weighted_solution(R, sigma)

@@ -1,6 +1,7 @@
 """`Identification`: what torque or M(q), g(q) tell about an arm, and how sure that is."""
 
 import dataclasses
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,11 @@ from jaxtyping import Bool, Float
 
 from ..arm import KNOWN, Arm
 from ..errors import InputError
-from ..files import finite, read_json, write_json
+from ..files import finite, output_folder, read_json, to_json
 from ..friction import Friction
 from ..parameters import coefficient_matrix, expression, linear_forms
+from .condensed import FILE as EVIDENCE_FILE
+from .condensed import Evidence
 
 SCHEMA = "jaxpanda.identification/1"
 FILE = "identification.json"
@@ -66,7 +69,13 @@ class Identification:
     """Noise of the filtered torque [N m] from a motion that repeats itself; no model can explain less."""
     known: Mapping[str, Float[np.ndarray, " dof"]] = dataclasses.field(default_factory=dict)
     """What the arm's model held beyond rigid links (`jaxpanda.arm.KNOWN`) and was not fitted."""
+    evidence: Evidence | None = None
+    """The recordings, condensed, where the method is one of motion and torque."""
     arm: str = ""
+    model: Arm | None = None
+    """The arm as it was before, with its nominal parameters."""
+    model_file: str = ""
+    """The MJCF that it was read from, where that is known."""
     link_names: tuple[str, ...] = ()
     joint_names: tuple[str, ...] = ()
     recordings: tuple[str, ...] = ()
@@ -108,6 +117,8 @@ class Identification:
             "schema": SCHEMA,
             "method": self.method,
             "arm": self.arm,
+            "model": None if self.model is None else self.model.to_json(),
+            "model_file": self.model_file or None,
             "rank": self.rank,
             "condition_number": self.condition_number,
             "relative_error_percent": self.relative_error_percent,
@@ -132,20 +143,33 @@ class Identification:
         }
 
     def save(self, folder: str | Path) -> Path:
-        """Write `folder/identification.json`, whole or not at all."""
-        path = Path(folder) / FILE
-        write_json(path, self.to_json())
-        return path
+        """Write `identification.json`, and the evidence as `identification.npz`; all or nothing."""
+        document = self.to_json()
+        with output_folder(folder) as scratch:
+            if self.evidence is not None:
+                self.evidence.save(scratch / EVIDENCE_FILE)
+                document["evidence"] = {"file": EVIDENCE_FILE, "sha256": _digest(scratch / EVIDENCE_FILE)}
+            (scratch / FILE).write_text(to_json(document), "utf-8")
+        return Path(folder) / FILE
 
     @classmethod
     def load(cls, path: str | Path) -> "Identification":
         """Read identification.json, a folder that holds it, or a bare table of coefficients.
 
+        The evidence comes along where it still stands beside the file.
+
         Raises:
             InputError: naming the file and the field of the first thing that is wrong.
         """
         path = Path(path)
-        return cls.from_json(read_json(path / FILE if path.is_dir() else path), where=str(path))
+        file = path / FILE if path.is_dir() else path
+        document = read_json(file)
+        found = cls.from_json(document, where=str(path))
+        wanted = _Reader(document, str(path)).table("evidence")
+        beside = file.with_name(EVIDENCE_FILE)
+        if not wanted or not beside.is_file() or _digest(beside) != wanted.get("sha256"):
+            return found
+        return dataclasses.replace(found, evidence=Evidence.load(beside))
 
     @classmethod
     def from_json(cls, document: Any, *, where: str = "identification") -> "Identification":
@@ -198,6 +222,8 @@ class Identification:
             noise=read.array("noise", (dof,)),
             known=known_physics(read.table("known"), dof, where),
             arm=str(read.get("arm", "")),
+            model=_model(read.table("model"), dof, where),
+            model_file=str(read.get("model_file", "")),
             link_names=links,
             joint_names=joints,
             recordings=read.names("recordings"),
@@ -224,6 +250,23 @@ def check_folds(folds: int) -> None:
     """Refuse a cross-validation that cannot be."""
     if folds < 0 or folds == 1:
         raise InputError(f"folds: {folds} cannot be; at least 2, or 0 for no cross-validation")
+
+
+def _model(document: Mapping[str, Any], dof: int, where: str) -> Arm | None:
+    if not document:
+        return None
+    try:
+        arm = Arm.from_json(document)
+        shapes = {name: np.asarray(getattr(arm, name)).shape for name in ("standard", *KNOWN)}
+        if shapes != {name: (dof, 10) if name == "standard" else (dof,) for name in shapes}:
+            raise ValueError(f"it is not of {dof} joints")
+    except (LookupError, TypeError, ValueError) as error:
+        raise InputError(f"{where}: model is not as `identify` writes it ({error}); identify again") from None
+    return arm
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _listed(values: np.ndarray | None) -> list[float]:

@@ -16,6 +16,7 @@ from ..friction import LINEAR, MODELS, Friction, check_model
 from ..parameters import Base, arm_base_parameters
 from ..recordings import Recording
 from ..signals import STILL, Signals, blocks_many, prepare, repeatability
+from .condensed import Condensed, Evidence
 from .one_step import PRIOR, Prior, feasible_least_squares
 from .regression import Fit, Masks, Regression, everything, excited, least_squares, regression, triangle
 from .result import RELIABLE, Identification, check_folds, of_model
@@ -84,7 +85,7 @@ def identify(
     _check_alive(recordings, signals, friction)
     problem = _pose(signals, arm, friction, weighting)
     if method == "one_step":
-        bounds = bounds or (Bounds.panda() if arm.name == "panda" else Bounds.around(arm))
+        bounds = bounds or Bounds.of(arm)
         if bounds.dof != arm.dof:
             raise InputError(f"bounds: of {bounds.dof} links, but the arm {arm.name} has {arm.dof}")
         if not prior > 0:
@@ -98,11 +99,13 @@ def identify(
     tick(0, 1 + folds)
     whole = solver(everything(problem.rigid))
     tick(1, 1 + folds)
-    held_out = _cross_validate(problem, solver, folds, tick) if folds else None
+    held_out, halves = _cross_validate(problem, solver, folds, tick) if folds else (None, [])
+    entire = Condensed.of(whole.regressions, everything(problem.rigid), problem.base.rank)
     return _result(
         problem,
         whole,
         held_out,
+        Evidence(entire, tuple(halves)),
         arm,
         method,
         recordings,
@@ -213,8 +216,14 @@ def _feasible(problem: _Problem, masks: Masks, **options: Any) -> _Solved:
 
 def _cross_validate(
     problem: _Problem, solver: _Solver, folds: int, tick: Callable[[int, int], None]
-) -> list[tuple[Float[np.ndarray, "dof time"], Bool[np.ndarray, " time"]]]:
-    """For each recording, residuals of samples that their fit has not seen, and which samples those are."""
+) -> tuple[
+    list[tuple[Float[np.ndarray, "dof time"], Bool[np.ndarray, " time"]]], list[tuple[Condensed, Condensed]]
+]:
+    """For each recording, residuals of samples that their fit has not seen, and which samples those are.
+
+    And for each fold what was seen and what was not.
+    """
+    halves = []
     residuals = [np.zeros_like(r.y) for r in problem.rigid]
     seen = [np.zeros(r.y.shape[1], bool) for r in problem.rigid]
     for k, splits in enumerate(blocks_many(problem.signals, folds)):
@@ -222,14 +231,17 @@ def _cross_validate(
         for r, residual, done, (_, test) in zip(solved.regressions, residuals, seen, splits, strict=True):
             residual[:, test] = r.residual(solved.fit.x)[:, test]
             done |= test
+        train, test = ([split[i] for split in splits] for i in (0, 1))
+        halves.append(tuple(Condensed.of(solved.regressions, m, problem.base.rank) for m in (train, test)))
         tick(2 + k, 1 + folds)
-    return list(zip(residuals, seen, strict=True))
+    return list(zip(residuals, seen, strict=True)), halves
 
 
 def _result(
     problem: _Problem,
     solved: _Solved,
     held_out: list[tuple[np.ndarray, np.ndarray]] | None,
+    evidence: Evidence,
     arm: Arm,
     method: str,
     recordings: Sequence[Recording],
@@ -273,7 +285,9 @@ def _result(
         cross_validated_relative_error_percent=unseen_percent,
         noise=np.sqrt(np.mean(np.square(floors), 0)) if floors else None,
         known=of_model(arm),
+        evidence=evidence,
         arm=arm.name,
+        model=arm,
         link_names=arm.link_names,
         joint_names=arm.joint_names,
         recordings=tuple(recording.name for recording in recordings),

@@ -108,7 +108,7 @@ def find_channels(
     return found
 
 
-_MAP = "; columns={'q_1': 'its name in the file', …} maps other names"
+_MAP = "; rename them, or name them from Python: load(path, columns={'q_1': 'its name in the file', …})"
 
 
 def _known(name: str) -> bool:

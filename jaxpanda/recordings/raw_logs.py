@@ -107,7 +107,8 @@ def find_logs(path: Path, columns: Mapping[str, str] | None = None) -> dict[str,
         if len(likely) > 1:
             names = ", ".join(file.name for file in likely)
             raise InputError(
-                f"{path}: {names} could each be {channel}: say columns={{'{channel}': 'the file meant'}}"
+                f"{path}: {names} could each be {channel}: move the others away, or say which from Python: "
+                f"load(path, columns={{'{channel}': 'the file meant'}})"
             )
         if likely:
             chosen[channel] = likely[0]

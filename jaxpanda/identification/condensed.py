@@ -1,0 +1,165 @@
+r"""The recordings as least squares sees them: what any links' torque error on them is, without the recordings.
+
+$$\lVert y_j - A_j x\rVert = \lVert R_j\,(x, -1)\rVert\ \text{up to sign, with}\ [A_j\; y_j] = Q_j R_j$$
+
+A joint's $R_j$ is as small as its columns are few, however long the recording. Those of all samples, and of every
+block that cross-validation holds out and of what is left then, are what `retrieve` needs to say how well its
+links explain torque, and how well such links do where they were not fitted.
+"""
+
+import dataclasses
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import scipy.optimize
+from jaxtyping import Float
+
+from ..errors import InputError
+from ..friction import DISSIPATIVE, LINEAR, Friction
+from .regression import Masks, Regression, triangle, triangles, weighted_fit
+
+FILE = "identification.npz"
+"""Stands beside identification.json."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Condensed:
+    """Some samples of the recordings, every joint's columns and torque as one triangle."""
+
+    R: Float[np.ndarray, "dof columns columns"]
+    """Of the base parameters' columns, the joint's own friction's, and the torque less what the model holds."""
+    samples: int
+    torque: float
+    """Norm of all joints' measured torque [N m], what relative errors are relative to."""
+
+    @classmethod
+    def of(cls, regressions: Sequence[Regression], masks: Masks, rank: int) -> "Condensed":
+        """The samples that masks leave."""
+        whole = triangles(regressions, masks)
+        dof, columns = len(whole), whole.shape[2]
+        extra = (columns - 1 - rank) // dof
+        own = [
+            [*range(rank), *range(rank + j * extra, rank + (j + 1) * extra), columns - 1] for j in range(dof)
+        ]
+        torque = np.sqrt(
+            sum(float(np.sum(r.tau[:, mask] ** 2)) for r, mask in zip(regressions, masks, strict=True))
+        )
+        R = np.stack([triangle(Rj[:, chosen]) for Rj, chosen in zip(whole, own, strict=True)])
+        return cls(R, sum(int(mask.sum()) for mask in masks), torque)
+
+    @property
+    def dof(self) -> int:
+        return len(self.R)
+
+    def residual(
+        self, beta: Float[np.ndarray, " base"], own: Float[np.ndarray, "dof extra"]
+    ) -> Float[np.ndarray, " dof"]:
+        """Norm of what base parameters and friction leave of each joint's torque [N m]."""
+        x = np.concatenate([np.tile(beta, (self.dof, 1)), own, -np.ones((self.dof, 1))], 1)
+        return np.linalg.norm(np.einsum("jrc,jc->jr", self.R, x), axis=1)
+
+    def classical(self, rank: int, weighting: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Least squares on these samples: base parameters, friction, and the residuals that weigh the joints."""
+        dof, extra = self.dof, self.R.shape[2] - 1 - rank
+        wide = np.zeros((dof, self.R.shape[1], rank + dof * extra + 1))
+        for j, R in enumerate(self.R):
+            wide[j, :, :rank] = R[:, :rank]
+            wide[j, :, rank + j * extra : rank + (j + 1) * extra] = R[:, rank:-1]
+            wide[j, :, -1] = R[:, -1]
+        fit = weighted_fit(wide, self.samples, weighting)
+        return fit.x[:rank], fit.x[rank:].reshape(dof, extra), fit.sigma
+
+    def weigh(self, rank: int, sigma: Float[np.ndarray, " dof"]) -> Float[np.ndarray, "base base"]:
+        r"""$T$ with $\lVert T\,\delta\rVert^2$ the weighted squares that moving base parameters by δ costs.
+
+        Each joint's friction follows as it serves best.
+        """
+        extra = self.R.shape[2] - 1 - rank
+        rows = []
+        for R, s in zip(self.R, sigma, strict=True):
+            friction_first = triangle(np.concatenate([R[:, rank:-1], R[:, :rank]], 1) / s)
+            rows.append(friction_first[extra:, extra:])
+        return triangle(np.concatenate(rows))
+
+    def following(
+        self, beta: Float[np.ndarray, " base"], least: Float[np.ndarray, " extra"]
+    ) -> Float[np.ndarray, "dof extra"]:
+        """The friction that serves given base parameters best, none of its parameters below `least`."""
+        rank = len(beta)
+        own = []
+        for R in self.R:
+            left, columns = R[:, -1] - R[:, :rank] @ beta, R[:, rank:-1]
+            scale = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
+            found = scipy.optimize.lsq_linear(columns / scale, left, (least * scale, np.inf), method="bvls")
+            own.append(found.x / scale)
+        return np.array(own)
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """What recordings hold against any links: as a whole, and block by block."""
+
+    whole: Condensed
+    folds: tuple[tuple[Condensed, Condensed], ...] = ()
+    """Of each fold of the cross-validation what it was fitted to, and what was held out."""
+
+    def save(self, path: Path) -> None:
+        """Write the arrays; whoever calls sees to it that nothing is left half-written."""
+        parts = [self.whole, *(part for fold in self.folds for part in fold)]
+        np.savez(
+            path,
+            R=np.stack([part.R for part in parts]),
+            samples=np.array([part.samples for part in parts]),
+            torque=np.array([part.torque for part in parts]),
+        )
+
+    @classmethod
+    def load(cls, path: Path) -> "Evidence":
+        """The inverse of `save`.
+
+        Raises:
+            InputError: the file is not as `identify` writes it.
+        """
+        try:
+            with np.load(path) as arrays:
+                parts = [
+                    Condensed(np.asarray(R, float), int(samples), float(torque))
+                    for R, samples, torque in zip(
+                        arrays["R"], arrays["samples"], arrays["torque"], strict=True
+                    )
+                ]
+            return cls(parts[0], tuple(zip(parts[1::2], parts[2::2], strict=True)))
+        except (OSError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
+            raise InputError(
+                f"{path}: is not as `identify` writes it ({error}); identify again, or take it away"
+            ) from None
+
+
+def own_parameters(friction: Friction | None, dof: int) -> Float[np.ndarray, "dof extra"]:
+    """What multiplies each joint's own columns."""
+    names = linear_names(friction)
+    return (
+        np.stack([np.asarray(friction.parameters[n]) for n in names], 1)
+        if friction and names
+        else np.zeros((dof, 0))
+    )
+
+
+def linear_names(friction: Friction | None) -> tuple[str, ...]:
+    """The parameters that friction is linear in."""
+    if friction is None:
+        return ()
+    return ("phi1",) if friction.model == "sigmoid" else LINEAR[friction.model]
+
+
+def least_friction(friction: Friction | None) -> Float[np.ndarray, " extra"]:
+    """Of each of those, what brakes and does not push."""
+    return np.array([0.0 if name in (*DISSIPATIVE, "phi1") else -np.inf for name in linear_names(friction)])
+
+
+def with_own_parameters(friction: Friction, own: Float[np.ndarray, "dof extra"]) -> Friction:
+    """The friction with other numbers."""
+    new = dict(zip(linear_names(friction), own.T, strict=True))
+    return dataclasses.replace(friction, parameters={**friction.parameters, **new})
