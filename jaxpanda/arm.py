@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from jaxpanda_kernels import Chain, rnea
 from jaxtyping import Array, Float
 
+FRICTION_LAW = ("friction_rate", "friction_slack")
+"""Fields of an `Arm` that say how the friction it holds turns with the velocity; None in both says nothing."""
 KNOWN = ("armature", "damping", "frictionloss", "stiffness", "springref")
 """Fields of an `Arm` that hold its physics beyond rigid links."""
 
@@ -37,6 +39,10 @@ class Arm(eqx.Module):
     joint_names: tuple[str, ...] = eqx.field(static=True)
     link_names: tuple[str, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
+    friction_rate: Float[Array, " dof"] | None = None
+    r"""b of the soft constraint that MuJoCo makes of `frictionloss` [1/s], f = clip((q̈ + b q̇)/R, ±F_c)."""
+    friction_slack: Float[Array, " dof"] | None = None
+    """R of the same [1/(kg m²)]."""
 
     @classmethod
     def from_mjcf(cls, path: str | Path) -> "Arm":

@@ -13,7 +13,7 @@ from jaxpanda_kernels import Chain
 from jaxtyping import Array, Float
 
 from . import files
-from .arm import Arm
+from .arm import FRICTION_LAW, Arm
 from .effects import (
     CATALOGUE,
     AbstractEffect,
@@ -194,7 +194,8 @@ class Corrected(eqx.Module):
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as numbers and names."""
-        arm = {name: _numbers(getattr(self.arm, name)) for name in _ARM_FIELDS}
+        told = [name for name in FRICTION_LAW if getattr(self.arm, name) is not None]
+        arm = {name: _numbers(getattr(self.arm, name)) for name in (*_ARM_FIELDS, *told)}
         chain = {
             name: np.asarray(getattr(self.arm.chain, name)).tolist()
             for name in ("R", "p", "prismatic", "gravity")
@@ -227,7 +228,8 @@ class Corrected(eqx.Module):
             jnp.asarray(arm["chain"]["prismatic"], bool),
             jnp.asarray(arm["chain"]["gravity"]),
         )
-        fields = {name: jnp.asarray(_from_numbers(arm[name], name)) for name in _ARM_FIELDS}
+        told = [name for name in FRICTION_LAW if name in arm]
+        fields = {name: jnp.asarray(_from_numbers(arm[name], name)) for name in (*_ARM_FIELDS, *told)}
         names = tuple(arm["joint_names"]), tuple(arm["link_names"]), arm["name"]
         effects = [effect_from_json(e) for e in document["effects"]]
         return cls(
@@ -263,7 +265,8 @@ def read(folder: str | Path) -> tuple[Corrected, Float[np.ndarray, " dof"]]:
 
 def _check_numbers(found: Corrected, noise: np.ndarray) -> None:
     arm, n = found.arm, found.arm.dof
-    named = {name: np.asarray(getattr(arm, name)) for name in _ARM_FIELDS} | {
+    told = [name for name in FRICTION_LAW if getattr(arm, name) is not None]
+    named = {name: np.asarray(getattr(arm, name)) for name in (*_ARM_FIELDS, *told)} | {
         "change": np.asarray(found.change),
         "damping_change": np.asarray(found.damping_change),
         "frictionloss_change": np.asarray(found.frictionloss_change),
