@@ -5,7 +5,7 @@ A user's file keeps every byte but the attributes that change. What MuJoCo's joi
 | law | MJCF |
 |---|---|
 | $F_v \dot q$ | `damping` |
-| $F_c\,\mathrm{sign}(\dot q)$ | `frictionloss`, with a stiff `solreffriction` and `solimpfriction`, or the file's own |
+| $F_c\,\mathrm{sign}(\dot q)$ | `frictionloss`, with stiff `solreffriction`, `solimpfriction` or the file's |
 | $F_o$ | nothing: a constant torque has no home on a joint |
 | sigmoid (eq. 25 of Gaz et al. 2019) | its level at speed, as `frictionloss` |
 

@@ -620,8 +620,8 @@ def _arm(model, links, chain: Chain, standard: np.ndarray, name: str) -> Arm:
 
 
 SOLREF, SOLIMP = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
-"""MuJoCo's defaults for the constraint that frictionloss is: time constant [s] and damping ratio; impedances, width
-[rad], midpoint and power of what is between them."""
+"""MuJoCo's defaults for the constraint that frictionloss is: time constant [s] and damping ratio; impedances,
+width [rad], midpoint and power of what is between them."""
 _IMPEDANCES = 1e-4, 0.9999
 """What MuJoCo takes for an impedance, at least and at most."""
 
@@ -632,10 +632,11 @@ def friction_law(
     r"""b [1/s] and R [1/(kg m²)] of the soft constraint that MuJoCo makes of `frictionloss`.
 
     $f = \mathrm{clip}((\ddot q + b\,\dot q)/R, \pm F_c)$ with $R = \frac{1 - d_0}{d_0}\,(M^{-1})_{jj}$ at the
-    reference pose, and of `solreffriction` either a time constant, $b = 2/(d_{max} T)$ with T of two time steps at
-    least where `refsafe` is on, or, where both of its numbers are negative, a damping: $b = -c/d_{max}$. What pulls
-    back to a position has no say, as this constraint has none; so $d_0$ counts and never the way to $d_{max}$,
-    except where there is no such way: then their mean (MuJoCo, Computation, "Solver parameters").
+    reference pose, and of `solreffriction` either a time constant, $b = 2/(d_{max} T)$ with T of two time
+    steps at least where `refsafe` is on, or, where both of its numbers are negative, a damping: $b =
+    -c/d_{max}$. What pulls back to a position has no say, as this constraint has none; so $d_0$ counts and
+    never the way to $d_{max}$, except where there is no such way: then their mean (MuJoCo, Computation,
+    "Solver parameters").
     """
     solref, solimp = model.dof_solref[dofs].copy(), model.dof_solimp[dofs]
     mixed = (solref[:, 0] > 0) != (solref[:, 1] > 0)

@@ -131,7 +131,8 @@ RUBS = '<joint name="second" axis="0 1 0" armature="0.01" frictionloss="0.3" ref
         (RUBS + ' solimpfriction="1 1"/>', ""),  # clipped
         (
             RUBS + ' class="gear"/>',
-            '<default><default class="gear"><joint solreffriction="0.03 1" solimpfriction="0.7"/></default></default>',
+            '<default><default class="gear"><joint solreffriction="0.03 1" solimpfriction="0.7"/></default>'
+            "</default>",
         ),
         (RUBS + "/>", '<default><joint frictionloss="0.1" solimpfriction="0.6 0.9"/></default>'),
     ],
@@ -154,6 +155,6 @@ def test_known_friction_turns_as_mujoco_has_it_turn(joint, before, tmp_path):
         mujoco.mj_step(model, data)
     (qd, qdd), friction = np.moveaxis(np.array(states), 1, 0), np.array(friction)
     share = held_sign(arm, qd, qdd, np.zeros(2))
-    assert 0.02 < np.mean(np.abs(share[:, 1]) < 0.99)
-    assert 0.02 < np.mean(np.abs(share[:, 1]) == 1.0)
+    turning = np.mean(np.abs(share[:, 1]) < 0.99)
+    assert 0.02 < turning < 0.98
     np.testing.assert_allclose(np.asarray(arm.frictionloss) * share, friction, atol=1e-5)

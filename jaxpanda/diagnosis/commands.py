@@ -97,6 +97,6 @@ def predict_files(diagnosis: Path, recording: Path, out: Path) -> Prediction:
     motion = load(recording)
     tau = predict(diagnosis, motion)
     head = ",".join(["time", *(f"tau_{j + 1}" for j in range(tau.shape[1]))])
-    table = np.column_stack([motion.time, tau]).tolist()
+    table = np.column_stack([motion.time if motion.stamps is None else motion.stamps, tau]).tolist()
     write_text(out, "\n".join([head, *(",".join(map(repr, row)) for row in table)]) + "\n")
     return Prediction(out, len(tau), tuple(float(v) for v in np.sqrt(np.mean(tau**2, 0))))

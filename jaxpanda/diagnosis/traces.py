@@ -310,10 +310,10 @@ def held_sign(
 ) -> Float[np.ndarray, "time dof"]:
     r"""Share of its frictionloss at which each joint's friction stands in MuJoCo, -1 to 1.
 
-    A soft constraint holds the joint: $f = \mathrm{clip}((\ddot q + b\,\dot q)/R, \pm F_c)$, b and R as the file has
-    them (`mjcf.friction_law`), or by MuJoCo's defaults for an arm from no file. On a light joint that is far from a
-    sign of the velocity; on a heavy one it would turn noise of a joint at rest into friction, so the velocity over
-    which it saturates is `least` [rad/s] at least.
+    A soft constraint holds the joint: $f = \mathrm{clip}((\ddot q + b\,\dot q)/R, \pm F_c)$, b and R as the
+    file has them (`mjcf.friction_law`), or by MuJoCo's defaults for an arm from no file. On a light joint
+    that is far from a sign of the velocity; on a heavy one it would turn noise of a joint at rest into
+    friction, so the velocity over which it saturates is `least` [rad/s] at least.
     """
     b, R = (None if law is None else np.asarray(law) for law in (arm.friction_rate, arm.friction_slack))
     if b is None or R is None:
