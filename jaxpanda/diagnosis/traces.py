@@ -101,6 +101,19 @@ class Trace:
         assert self.tau is not None
         return self.tau - self.motion.torque
 
+    @property
+    def residual_at_rest(self) -> Float[np.ndarray, "time dof"]:
+        """`residual` with the model's Coulomb friction left out, of which a joint at rest shows no sign [N m]."""
+        assert self.tau is not None
+        return self.tau - self.motion.load - np.asarray(self.motion.arm.damping) * self.motion.qd
+
+    @property
+    def torque_step(self) -> Float[np.ndarray, " dof"]:
+        """What measured torque is written in, at most: the least difference between two rows [N m]."""
+        assert self.signals.tau is not None
+        steps = np.abs(np.diff(self.signals.tau, axis=0))
+        return np.min(np.where(steps > 0, steps, np.inf), axis=0, initial=1e9)
+
     @functools.cached_property
     def shaken(self) -> Float[np.ndarray, "time dof bands"]:
         r"""What noise of the encoders may have put into the nominal torque, in the bands where it is most of
