@@ -365,8 +365,8 @@ class Problem:
             names = ", ".join(t.name for t in self.traces)
             raise InputError(
                 f"{names}: {samples:.0f} samples (of {rows}) that tell of a joint, at most, are too few to tell"
-                " physics from noise; record longer, or more motion: of seven joints that move all the time 2 s at"
-                " 100 Hz or more are enough"
+                " physics from noise; record longer, or more motion: of seven joints that move all the time"
+                " 2 s at 100 Hz or more are enough"
             )
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         return Noise(np.stack(a), np.array(sigma), np.array(std))

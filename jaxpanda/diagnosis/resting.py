@@ -69,6 +69,8 @@ _SIZES = 1.0, 0.2
 """Half of what happens is of the declared deviations, half smaller by this."""
 _LEANS = 0.2
 """Share of the forces from outside that point straight down, or up, as a weight does."""
+_VARIES = 2.5
+"""How far the variance of noise from block to block may differ by chance, in itself."""
 _STEADY = {
     "": 0.5,
     "payload": 0.12,
@@ -477,7 +479,7 @@ def _events(level: Level, arm: Arm) -> list[Finding]:
 
 
 def _held(level: Level, first: int, last: int) -> float:
-    """How likely what is hung on is, by how torque varies during an event: a hand varies its force, a body does not.
+    """How likely a body is, by how torque varies during an event: a hand varies its force, a body does not.
 
     Likelihood ratio of the variance from block to block being what it is elsewhere, 1e-3 at least; elsewhere by
     the lower quartile, as there may be other events.
@@ -486,9 +488,9 @@ def _held(level: Level, first: int, last: int) -> float:
     if len(inner) < 4:
         return 1.0
     usual = np.quantile(np.abs(np.diff(level.mean, axis=0)), 0.25, axis=0) / 0.3186
-    ratio = np.mean(np.diff(inner, axis=0) ** 2, 0) / np.maximum(usual, 1e-9) ** 2
+    ratio = np.mean(np.diff(inner, axis=0) ** 2, 0) / np.maximum(usual, 1e-9) ** 2 / _VARIES
     said = 0.5 * (len(inner) - 1) * np.where(ratio > 1, ratio - 1 - np.log(np.maximum(ratio, 1e-9)), 0.0)
-    return float(np.exp(-np.clip(said.max() - 2.0, 0.0, 6.9)))
+    return float(np.exp(-np.clip(said.max(), 0.0, 6.9)))
 
 
 def _drifts(level: Level, first: int, last: int) -> float:
@@ -603,11 +605,13 @@ def _told(
     joints = (model.link,) if model.link is not None else tuple(seen) or tuple(range(dof))
     if effect == "gravity_direction":
         joints = tuple(range(dof))
+    place = None if model.link is None else model.link + 1
+    units = model.scale * np.array([scale for _, _, scale in model.names])
+    deviations = np.sqrt(np.diag(fit.covariance))
     parameters: list[dict[str, Any]] = [
-        {"name": name, "joint": None if model.link is None else model.link + 1, "value": float(x * scale * model.scale),
-         "std": float(np.sqrt(v) * scale * model.scale), "unit": unit}
-        for (name, unit, scale), x, v in zip(model.names, fit.x, np.diag(fit.covariance), strict=False)
-    ]  # fmt: skip
+        {"name": name, "joint": place, "value": float(x * size), "std": float(std * size), "unit": unit}
+        for (name, unit, _), x, std, size in zip(model.names, fit.x, deviations, units, strict=False)
+    ]
     torque, wide = model.columns @ fit.x, np.hypot(std, bound / np.sqrt(3))
     if not parameters and len(levels) == 1:
         parameters = [
