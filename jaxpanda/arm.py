@@ -10,10 +10,13 @@ import numpy as np
 from jaxpanda_kernels import Chain, rnea
 from jaxtyping import Array, Float
 
+FRICTION_LAW = ("friction_rate", "friction_slack")
+"""Fields of an `Arm` that say how the friction it holds turns with the velocity; None in both says nothing."""
 KNOWN = ("armature", "damping", "frictionloss", "stiffness", "springref")
 """Fields of an `Arm` that hold its physics beyond rigid links."""
 NUMBERS = ("standard", *KNOWN, "lower", "upper")
 """Fields of an `Arm` that are arrays of its own."""
+_OPTIONAL = ("lumped", *FRICTION_LAW)
 
 
 class Arm(eqx.Module):
@@ -43,6 +46,10 @@ class Arm(eqx.Module):
     name: str = eqx.field(static=True)
     lumped: Float[Array, "dof 10"] | None = None
     """Of `standard`, what belongs to bodies that are fixed to a link; None where no link has such a body."""
+    friction_rate: Float[Array, " dof"] | None = None
+    r"""b of the soft constraint that MuJoCo makes of `frictionloss` [1/s], f = clip((q̈ + b q̇)/R, ±F_c)."""
+    friction_slack: Float[Array, " dof"] | None = None
+    """R of the same [1/(kg m²)]."""
 
     @classmethod
     def from_mjcf(cls, path: str | Path) -> "Arm":
@@ -74,7 +81,10 @@ class Arm(eqx.Module):
             "link_names": list(self.link_names),
             "chain": {name: np.asarray(getattr(self.chain, name)).tolist() for name in _CHAIN},
             **{name: _listed(getattr(self, name)) for name in NUMBERS},
-            "lumped": None if self.lumped is None else np.asarray(self.lumped).tolist(),
+            **{
+                name: None if (x := getattr(self, name)) is None else np.asarray(x).tolist()
+                for name in _OPTIONAL
+            },
         }
 
     @classmethod
@@ -88,7 +98,7 @@ class Arm(eqx.Module):
             joint_names=tuple(document["joint_names"]),
             link_names=tuple(document["link_names"]),
             name=document["name"],
-            lumped=None if document.get("lumped") is None else jnp.asarray(document["lumped"]),
+            **{name: None if (x := document.get(name)) is None else jnp.asarray(x) for name in _OPTIONAL},
         )
 
     def unit(self, turning: str, joint: int | None = None) -> str:

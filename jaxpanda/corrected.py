@@ -13,7 +13,7 @@ from jaxpanda_kernels import Chain
 from jaxtyping import Array, Float
 
 from . import files
-from .arm import NUMBERS, Arm
+from .arm import FRICTION_LAW, NUMBERS, Arm
 from .effects import (
     CATALOGUE,
     AbstractEffect,
@@ -251,7 +251,8 @@ def read(folder: str | Path) -> tuple[Corrected, Float[np.ndarray, " dof"]]:
 
 def _check_numbers(found: Corrected, noise: np.ndarray) -> None:
     arm, n = found.arm, found.arm.dof
-    named = {name: np.asarray(getattr(arm, name)) for name in NUMBERS} | {
+    told = [name for name in FRICTION_LAW if getattr(arm, name) is not None]
+    named = {name: np.asarray(getattr(arm, name)) for name in (*NUMBERS, *told)} | {
         "change": np.asarray(found.change),
         "damping_change": np.asarray(found.damping_change),
         "frictionloss_change": np.asarray(found.frictionloss_change),

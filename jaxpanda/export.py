@@ -5,7 +5,7 @@ A user's file keeps every byte but the attributes that change. What MuJoCo's joi
 | law | MJCF |
 |---|---|
 | $F_v \dot q$ | `damping` |
-| $F_c\,\mathrm{sign}(\dot q)$ | `frictionloss`, with a stiff `solreffriction` and `solimpfriction` |
+| $F_c\,\mathrm{sign}(\dot q)$ | `frictionloss`, with stiff `solreffriction`, `solimpfriction` or the file's |
 | $F_o$ | nothing: a constant torque has no home on a joint |
 | sigmoid (eq. 25 of Gaz et al. 2019) | its level at speed, as `frictionloss` |
 
@@ -34,7 +34,15 @@ from .files import read_json, to_json, write_text
 from .friction import Friction
 from .lint import ignored_by_mjx
 from .markup import numbers
-from .mjcf import MjcfLink, MjcfSource, com_from_standard, from_document, move_standard, standard_from_com
+from .mjcf import (
+    MjcfLink,
+    MjcfSource,
+    com_from_standard,
+    from_document,
+    has_own_friction_law,
+    move_standard,
+    standard_from_com,
+)
 from .panda import panda, published
 
 SIDECAR = "jaxpanda.sidecar/1"
@@ -347,7 +355,8 @@ def _joint_edits(
                 continue
             degrees = name == "springref" and source.degrees and not before.chain.prismatic[i]
             values[name] = numbers(np.rad2deg(float(value[i])) if degrees else value[i])
-        if joints["frictionloss"][i] > 0 and "frictionloss" in values:
+        own = has_own_friction_law(source.model, source.links[i].dof)
+        if joints["frictionloss"][i] > 0 and "frictionloss" in values and not own:
             values |= dry_friction(source.model.opt.timestep)
         if values:
             edits.append(markup.Edit(_joint_element(body), values))

@@ -14,7 +14,7 @@ brings z onto the axis, with its origin at the joint's position.
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -597,6 +597,8 @@ def _arm(model, links, chain: Chain, standard: np.ndarray, name: str) -> Arm:
     limited = model.jnt_limited[joints].astype(bool)
     lumped = np.stack([link.lumped_standard for link in links])
 
+    rate, slack = friction_law(model, dofs)
+
     def unless(flag: str, values: np.ndarray):
         return jnp.asarray(np.zeros(len(links)) if _disabled(model, flag) else values)
 
@@ -614,7 +616,46 @@ def _arm(model, links, chain: Chain, standard: np.ndarray, name: str) -> Arm:
         link_names=tuple(link.body for link in links),
         name=name,
         lumped=jnp.asarray(lumped) if np.any(lumped) else None,
+        friction_rate=jnp.asarray(rate),
+        friction_slack=jnp.asarray(slack),
     )
+
+
+SOLREF, SOLIMP = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
+"""MuJoCo's defaults for the constraint that frictionloss is: time constant [s] and damping ratio; impedances,
+width [rad], midpoint and power of what is between them."""
+_IMPEDANCES = 1e-4, 0.9999
+"""What MuJoCo takes for an impedance, at least and at most."""
+
+
+def friction_law(
+    model: mujoco.MjModel, dofs: Sequence[int]
+) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
+    r"""b [1/s] and R [1/(kg m²)] of the soft constraint that MuJoCo makes of `frictionloss`.
+
+    $f = \mathrm{clip}((\ddot q + b\,\dot q)/R, \pm F_c)$ with $R = \frac{1 - d_0}{d_0}\,(M^{-1})_{jj}$ at the
+    reference pose, and of `solreffriction` either a time constant, $b = 2/(d_{max} T)$ with T of two time
+    steps at least where `refsafe` is on, or, where both of its numbers are negative, a damping: $b =
+    -c/d_{max}$. What pulls back to a position has no say, as this constraint has none; so $d_0$ counts and
+    never the way to $d_{max}$, except where there is no such way: then their mean (MuJoCo, Computation,
+    "Solver parameters").
+    """
+    solref, solimp = model.dof_solref[dofs].copy(), model.dof_solimp[dofs]
+    mixed = (solref[:, 0] > 0) != (solref[:, 1] > 0)
+    solref[mixed] = SOLREF  # MuJoCo warns and does so
+    least = 0.0 if _disabled(model, "REFSAFE") else 2 * model.opt.timestep
+    first, most = np.clip(solimp[:, :2], *_IMPEDANCES).T
+    impedance = np.where(solimp[:, 2] <= mujoco.mjMINVAL, (first + most) / 2, first)
+    time = np.maximum(solref[:, 0], least)
+    b = np.where(solref[:, 1] > 0, 2 / np.maximum(most * time, mujoco.mjMINVAL), -solref[:, 1] / most)
+    R = (1 - impedance) / impedance * model.dof_invweight0[dofs]
+    return b, np.maximum(R, mujoco.mjMINVAL)
+
+
+def has_own_friction_law(model: mujoco.MjModel, dof: int) -> bool:
+    """Whether the file says how the friction of a joint turns: it has some, and not with MuJoCo's defaults."""
+    same = np.array_equal(model.dof_solref[dof], SOLREF) and np.array_equal(model.dof_solimp[dof], SOLIMP)
+    return bool(model.dof_frictionloss[dof] > 0) and not same
 
 
 def _disabled(model: mujoco.MjModel, flag: str) -> bool:

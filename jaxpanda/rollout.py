@@ -39,7 +39,15 @@ from .corrected import XML, Corrected, Plant, read
 from .effects import masses, slopes
 from .errors import InputError, require_x64
 from .export import dry_friction
-from .mjcf import MjcfSource, com_from_standard, from_mjcf, move_standard, own_log, standard_from_com
+from .mjcf import (
+    MjcfSource,
+    com_from_standard,
+    from_mjcf,
+    has_own_friction_law,
+    move_standard,
+    own_log,
+    standard_from_com,
+)
 from .recordings import Recording
 from .recordings import load as load_recording
 from .signals import derivatives, prepare, zero_phase
@@ -219,7 +227,8 @@ def engine_model(source: MjcfSource, arm: Arm) -> mujoco.MjModel:
     )
     bare.opt.gravity = np.asarray(arm.chain.gravity)
     level = np.asarray(arm.frictionloss)
-    for j in np.flatnonzero(~np.isclose(level, bare.dof_frictionloss) & (level > 0)):
+    own = np.array([has_own_friction_law(bare, j) for j in range(bare.nv)])
+    for j in np.flatnonzero(~np.isclose(level, bare.dof_frictionloss) & (level > 0) & ~own):
         for text, place in zip(
             dry_friction(bare.opt.timestep).values(), (bare.dof_solref, bare.dof_solimp), strict=True
         ):

@@ -320,6 +320,7 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Export": export,
     "Validation": validation,
     "Diagnosis": diagnosis,
+    "AtRest": diagnosis,
     "Prediction": lambda result: [Section("Prediction", result.lines())],
     "Demonstration": lambda result: result.sections,
 }

@@ -348,6 +348,18 @@ def test_frictionloss_is_coulombs_law_with_the_solver_settings_written():
     assert np.all(friction_errors(stiff=True) < 0.01)
 
 
+def test_the_way_friction_turns_in_a_file_stays_as_it_is(tmp_path):
+    """A changed level came with the stiff settings of an export, whatever the user had written."""
+    file = tmp_path / "arm.xml"
+    own = 'frictionloss="0.3" solreffriction="0.004 1" solimpfriction="0.99 0.999 0.001"'
+    file.write_text(chain_of(f'<joint name="second" axis="0 1 0" {own}/>'))
+    arm, source = from_mjcf(file)
+    found = Friction("coulomb_viscous", {"viscous": np.zeros(2), "coulomb": np.array([0.2, 0.2])})
+    text = write_parameters(source, arm, None, found).text
+    assert own.replace('"0.3"', '"0.5"') in text
+    assert text.count("solreffriction") == 2  # the other joint had no friction and gets the stiff settings
+
+
 @pytest.mark.slow
 def test_the_own_panda_runs_in_mjx():
     from mujoco import mjx

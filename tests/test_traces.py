@@ -4,11 +4,13 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
+from mjcf_cases import chain_of
 
 from jaxpanda import Arm, Recording
-from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.diagnosis.traces import held_sign, prepare
 from jaxpanda.effects.friction import FrictionDrift, LoadDependentFriction
 from jaxpanda.effects.motion import Channels
 from jaxpanda.effects.sensing import TorqueDrift
@@ -109,3 +111,50 @@ def test_a_drift_seen_for_its_time_constant_goes_on_to_where_it_settles(drift):
     for t in (3.0, 10.0, 30.0):
         np.testing.assert_allclose(at(t), free.at(Channels(jnp.asarray(t), *(jnp.ones(2),) * 5)), rtol=1e-12)
     np.testing.assert_allclose(at(30.0)[0], -np.expm1(-6.0), rtol=1e-6)
+
+
+RUBS = '<joint name="second" axis="0 1 0" armature="0.01" frictionloss="0.3" ref="20"'
+
+
+@pytest.mark.parametrize(
+    ("joint", "before"),
+    [
+        (RUBS + "/>", ""),
+        (RUBS + ' solreffriction="0.004 1" solimpfriction="0.99 0.999 0.001"/>', ""),
+        (RUBS + ' solreffriction="0.001 1"/>', ""),  # less than two steps: `refsafe` lifts it
+        (RUBS + ' solreffriction="0.003 1"/>', '<option><flag refsafe="disable"/></option>'),
+        (RUBS + ' solreffriction="-300 -40" solimpfriction="0.5 0.8 0.01"/>', ""),
+        (
+            RUBS + ' solreffriction="0.05 1" solimpfriction="0.5 0.8 0"/>',
+            "",
+        ),  # a width of nothing: their mean
+        (RUBS + ' solimpfriction="1 1"/>', ""),  # clipped
+        (
+            RUBS + ' class="gear"/>',
+            '<default><default class="gear"><joint solreffriction="0.03 1" solimpfriction="0.7"/></default>'
+            "</default>",
+        ),
+        (RUBS + "/>", '<default><joint frictionloss="0.1" solimpfriction="0.6 0.9"/></default>'),
+    ],
+)
+def test_known_friction_turns_as_mujoco_has_it_turn(joint, before, tmp_path):
+    """The file's own `solreffriction` and `solimpfriction`; MuJoCo's defaults stood for every file."""
+    file = tmp_path / "arm.xml"
+    file.write_text(chain_of(joint, before=before))
+    arm, model = Arm.from_mjcf(file), mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(model)
+    model.opt.gravity[:] = 0.0
+    start = data.qpos.copy()
+    states, friction = [], []
+    for k in range(2000):
+        wanted = start + 0.1 * np.sin(np.array([9e-3, 7e-3]) * k)
+        data.qfrc_applied[:] = 40 * (wanted - data.qpos) - 2 * data.qvel
+        mujoco.mj_forward(model, data)
+        states.append((data.qvel.copy(), data.qacc.copy()))
+        friction.append(-data.qfrc_constraint)
+        mujoco.mj_step(model, data)
+    (qd, qdd), friction = np.moveaxis(np.array(states), 1, 0), np.array(friction)
+    share = held_sign(arm, qd, qdd, np.zeros(2))
+    turning = np.mean(np.abs(share[:, 1]) < 0.99)
+    assert 0.02 < turning < 0.98
+    np.testing.assert_allclose(np.asarray(arm.frictionloss) * share, friction, atol=1e-5)

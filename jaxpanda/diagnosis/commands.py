@@ -15,7 +15,7 @@ from ..export import missing_assets
 from ..files import output_folder, write_text
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
-from . import page
+from . import page, resting
 from .diagnosis import Diagnosis, diagnose, predict
 from .host import on_host
 from .knowledge import Knowledge
@@ -49,7 +49,7 @@ def diagnose_files(
     recordings: Sequence[Path],
     reference: Sequence[Path],
     knowledge: Knowledge,
-) -> Diagnosis:
+) -> Diagnosis | resting.AtRest:
     """`jaxpanda diagnose`."""
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
@@ -64,8 +64,13 @@ def diagnose_files(
         sources = tuple(_source(role, path, names) for role, path in given)
         missing = (f"{XML}: {what}" for what in missing_assets(found.written, out))
         notes = (*found.notes, *missing)
-        found = _replayed(dataclasses.replace(found, sources=sources, notes=notes), suspect)
-        report.to_html("jaxpanda: diagnosis", page.sections(found), folder / "report.html")
+        found = dataclasses.replace(found, sources=sources, notes=notes)
+        if isinstance(found, resting.AtRest):
+            sections = resting.sections(found)
+        else:
+            found = _replayed(found, suspect)
+            sections = page.sections(found)
+        report.to_html("jaxpanda: diagnosis", sections, folder / "report.html")
         found.save(out)  # not by way of the other folder: what is included may belong outside of `out`
     return found
 
@@ -97,6 +102,6 @@ def predict_files(diagnosis: Path, recording: Path, out: Path) -> Prediction:
     motion = load(recording)
     tau = predict(diagnosis, motion)
     head = ",".join(["time", *(f"tau_{j + 1}" for j in range(tau.shape[1]))])
-    table = np.column_stack([motion.time, tau]).tolist()
+    table = np.column_stack([motion.time if motion.stamps is None else motion.stamps, tau]).tolist()
     write_text(out, "\n".join([head, *(",".join(map(repr, row)) for row in table)]) + "\n")
     return Prediction(out, len(tau), tuple(float(v) for v in np.sqrt(np.mean(tau**2, 0))))

@@ -32,12 +32,13 @@ from ..recordings import Recording, distinct, load
 from . import knowledge as knowledge_
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
-from .finding import Finding
+from .finding import Finding, Fit
 from .host import on_host
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
+from .resting import AtRest, judge, rests
 from .search import transferable
 from .state import State, with_terms
 from .traces import Trace, prepare
@@ -51,20 +52,6 @@ UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""
 UNSURE, MISSED = 0.6, 2.0
 """Confidence that no finding reaches, and held-out error over the noise, where not all is taken for explained."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Fit:
-    """How well torque is reproduced, in the band of the diagnosis [N m]."""
-
-    rmse_before: Float[np.ndarray, " dof"]
-    rmse_after: Float[np.ndarray, " dof"]
-    held_out_rmse_before: Float[np.ndarray, " dof"]
-    held_out_rmse_after: Float[np.ndarray, " dof"]
-    noise_floor: Float[np.ndarray, " dof"]
-
-    def to_json(self) -> dict[str, list[float]]:
-        return {f.name: [float(v) for v in getattr(self, f.name)] for f in dataclasses.fields(self)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,8 +177,8 @@ def diagnose(
     *,
     reference: Sequence[str | Path | Recording] = (),
     knowledge: knowledge_.Knowledge = "identified",
-) -> Diagnosis:
-    """Say which physics a simulation is missing.
+) -> Diagnosis | AtRest:
+    """Say which physics a simulation is missing; of an arm that holds still, what friction at rest leaves open.
 
     Args:
         model: the simulation (MJCF) as the user has it; None for the project's own Panda.
@@ -214,14 +201,14 @@ def diagnose(
     traces, active = [], [i < len(recordings) for i in range(len(loaded))]
     for recording in distinct(loaded):
         recording.require_dof(arm.dof)
-        _require_live_torque(recording)
+        recording.require_tau()
         traces.append(prepare(recording, arm))
     suspect = [trace for trace, on in zip(traces, active, strict=True) if on]
-    if not any(trace.trust.any() for trace in suspect):
-        raise InputError(
-            f"{', '.join(trace.name for trace in suspect)}: no joint moves; friction at rest may carry any load,"
-            " so that a diagnosis needs motion"
-        )
+    if all(rests(trace) for trace in suspect):
+        healthy = [trace for trace, on in zip(traces, active, strict=True) if not on]
+        return judge(suspect, healthy, source, knowledge)
+    for recording in loaded:
+        _require_live_torque(recording)
     log: list[str] = []
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
     problem = premises.problem

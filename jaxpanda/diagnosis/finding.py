@@ -44,6 +44,20 @@ class Finding:
         }
 
 
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """How well torque is reproduced, in the band of the diagnosis [N m]."""
+
+    rmse_before: Float[np.ndarray, " dof"]
+    rmse_after: Float[np.ndarray, " dof"]
+    held_out_rmse_before: Float[np.ndarray, " dof"]
+    held_out_rmse_after: Float[np.ndarray, " dof"]
+    noise_floor: Float[np.ndarray, " dof"]
+
+    def to_json(self) -> dict[str, list[float]]:
+        return {f.name: [float(v) for v in getattr(self, f.name)] for f in dataclasses.fields(self)}
+
+
 def joined(spans: Sequence[tuple[float, float]], pause: float) -> tuple[tuple[float, float], ...]:
     """Spans in order, those with no longer a pause between them made one."""
     out = list(spans[:1])

@@ -136,6 +136,10 @@ class Saturation:
         """Whether the recordings are long enough for the model to leave noise of a joint to be seen."""
         return self._basis(joint).tells
 
+    def samples(self, joint: int) -> float:
+        """How many samples tell of a joint: fewer than there are where they weigh unalike."""
+        return self._basis(joint).count
+
     def free(self, joint: int) -> float:
         """How many samples the model leaves: noise's variance is known to a share of about sqrt(2 / free)."""
         return max(self._basis(joint).free, 1.0)

@@ -426,11 +426,13 @@ class Problem:
         ripples = self.saturation.ripples  # made once, before there are threads
         heard = {j for j in range(self.dof) if self.saturation.tells(j)}
         if not heard:
-            samples = sum(np.count_nonzero(t.weights.any(1)) for t in self.traces)
+            samples = max(self.saturation.samples(j) for j in range(self.dof))
+            rows = sum(t.motion.samples for t in self.traces)
             names = ", ".join(t.name for t in self.traces)
             raise InputError(
-                f"{names}: {samples} samples that can be used are too few to tell"
-                " physics from noise; record longer: of seven joints 2 s at 100 Hz or more are enough"
+                f"{names}: {samples:.0f} samples (of {rows}) that tell of a joint, at most, are too few to tell"
+                " physics from noise; record longer, or more motion: of seven joints that move all the time"
+                " 2 s at 100 Hz or more are enough"
             )
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         off = self._known_unresolved + sum(t.unresolved for t in terms if t.unresolved is not None)

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from .. import signals as signals_
 from ..arm import Arm
 from ..effects import Channels, Motion, Stretches, masses
+from ..mjcf import SOLIMP, SOLREF
 from ..recordings import Recording
 
 WORK_RATE = 100.0
@@ -51,8 +52,6 @@ _UNFELT = 1e-12
 """Share of the low-pass filter's response that is cut off at either end."""
 _CONTINUED = 0.3
 """At the ends of a recording, over which q is fitted to continue it [s]."""
-_SOLREF, _IMPEDANCE_LEAST, _IMPEDANCE_MOST = 0.02, 0.9, 0.95
-"""MuJoCo's defaults for the constraint that frictionloss is: time constant [s], impedance at rest and beyond."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,6 +100,19 @@ class Trace:
         """Measured less nominal torque [N m]."""
         assert self.tau is not None
         return self.tau - self.motion.torque
+
+    @property
+    def residual_at_rest(self) -> Float[np.ndarray, "time dof"]:
+        """`residual` with the model's Coulomb friction left out, of which a joint at rest shows no sign [N m]."""
+        assert self.tau is not None
+        return self.tau - self.motion.load - np.asarray(self.motion.arm.damping) * self.motion.qd
+
+    @property
+    def torque_step(self) -> Float[np.ndarray, " dof"]:
+        """What measured torque is written in, at most: the least difference between two rows [N m]."""
+        assert self.signals.tau is not None
+        steps = np.abs(np.diff(self.signals.tau, axis=0))
+        return np.min(np.where(steps > 0, steps, np.inf), axis=0, initial=1e9)
 
     @functools.cached_property
     def shaken(self) -> Float[np.ndarray, "time dof bands"]:
@@ -300,17 +312,19 @@ def held_sign(
 ) -> Float[np.ndarray, "time dof"]:
     r"""Share of its frictionloss at which each joint's friction stands in MuJoCo, -1 to 1.
 
-    A soft constraint holds the joint: $f = \mathrm{clip}(D\,(\ddot q + b\,\dot q), \pm F_c)$ with
-    $b = 2/(d_{max} T)$ and $D = \frac{d_0}{1 - d_0} / (M^{-1})_{jj}$ at the reference pose. On a light joint that
-    is far from a sign of the velocity; on a heavy one it would turn noise of a joint at rest into friction, so
-    the velocity over which it saturates is `least` [rad/s] at least.
+    A soft constraint holds the joint: $f = \mathrm{clip}((\ddot q + b\,\dot q)/R, \pm F_c)$, b and R as the
+    file has them (`mjcf.friction_law`), or by MuJoCo's defaults for an arm from no file. On a light joint
+    that is far from a sign of the velocity; on a heavy one it would turn noise of a joint at rest into
+    friction, so the velocity over which it saturates is `least` [rad/s] at least.
     """
-    level = np.asarray(arm.frictionloss)
-    M = masses(arm, np.zeros((1, arm.dof)))[0]
-    stiffness = _IMPEDANCE_LEAST / (1 - _IMPEDANCE_LEAST) / np.maximum(np.diag(np.linalg.inv(M)), 1e-9)
-    b = 2 / (_IMPEDANCE_MOST * _SOLREF)
-    width = np.maximum(level / (stiffness * b), np.maximum(least, 1e-6))
-    return np.clip((qd + qdd / b) / width, -1.0, 1.0)
+    b, R = (None if law is None else np.asarray(law) for law in (arm.friction_rate, arm.friction_slack))
+    if b is None or R is None:
+        impedance, most = SOLIMP[:2]
+        b = np.full(arm.dof, 2 / (most * SOLREF[0]))
+        M = masses(arm, np.zeros((1, arm.dof)))[0]
+        R = (1 - impedance) / impedance * np.maximum(np.diag(np.linalg.inv(M)), 1e-9)
+    width = np.maximum(np.asarray(arm.frictionloss) * R, b * np.maximum(least, 1e-6))
+    return np.clip((b * qd + qdd) / np.maximum(width, 1e-12), -1.0, 1.0)
 
 
 def position_cutoff(

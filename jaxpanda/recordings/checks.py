@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from ..errors import InputError
+from .clock import on_clock
 from .glitches import without_glitches
 from .recording import Recording
 
@@ -29,7 +30,8 @@ _FASTEST = 10.0
 
 def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Recording:
     """The same recording, once its numbers are finite, ordered, long enough and in SI units; of readings that
-    stand alone (`glitches`) the rows are left out, and that is told.
+    stand alone (`glitches`) the rows are left out, samples that were uniform are on their ticks (`clock`),
+    and that is told.
 
     Args:
         recording: as read.
@@ -48,7 +50,7 @@ def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Re
     _radians(recording)
     _newton_metres(recording)
     _velocity_unit(recording)
-    return recording
+    return on_clock(recording)
 
 
 def _columns(recording: Recording):

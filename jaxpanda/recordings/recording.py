@@ -32,6 +32,8 @@ class Recording:
     """How many rows or values reading dropped, filled or moved, by what was done; empty if none."""
     notes: tuple[str, ...] = ()
     """What else reading found out, and the evidence for the repairs, in plain words."""
+    stamps: Float[np.ndarray, " time"] | None = None
+    """Time as it was written [s], where rows were moved to ticks; else None."""
 
     @property
     def dof(self) -> int:

@@ -1,0 +1,156 @@
+"""An arm that holds still: what is beyond friction at rest is told, what is within it is not."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from jaxpanda import Arm, Recording
+from jaxpanda.__main__ import main
+from jaxpanda.diagnosis import diagnose, predict
+from jaxpanda.diagnosis.resting import AtRest, judge
+from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.effects import Motion
+from jaxpanda.export import panda_mjcf
+from jaxpanda.mjcf import from_mjcf
+from jaxpanda.recordings import save
+
+LOSS = 0.4
+"""Of every joint [N m]."""
+SECONDS, RATE = 8.0, 100.0
+
+
+@pytest.fixture(scope="module")
+def rubbing(tmp_path_factory):
+    """The project's Panda with frictionloss, as a file."""
+    path = tmp_path_factory.mktemp("model") / "panda.xml"
+    path.write_text(panda_mjcf().replace("<joint name=", f'<joint frictionloss="{LOSS}" name='))
+    return path
+
+
+def rest(
+    seed: int, extra=None, *, slow: bool = False, pose: int | None = None, gives: float = 0.0
+) -> Recording:
+    """A pose held with noise of 0.05 N m; friction at rest carries what it likes. `extra(t, pose)` is added."""
+    rng, arm = np.random.default_rng(seed), Arm.panda()
+    t = np.arange(int(SECONDS * RATE)) / RATE
+    lower, upper = np.asarray(arm.lower), np.asarray(arm.upper)
+    way = np.random.default_rng(seed if pose is None else pose).uniform(-0.3, 0.3, 7)
+    q = 0.5 * (lower + upper) + (upper - lower) * way
+    at = Motion(arm, np.array([0.0, 1.0]), np.stack([q, q]), *np.zeros((3, 2, 7)))
+    keep = np.exp(-1 / (0.15 * RATE)) if slow else 0.0
+    noise = lfilter([np.sqrt(1 - keep**2)], [1, -keep], rng.normal(size=(len(t), 7)), axis=0)
+    tau = at.load[0] + 0.05 * noise + LOSS * rng.uniform(-1, 1, 7)
+    tau = tau + (0.0 if extra is None else extra(t, at))
+    yields = gives * ((t > 3) & (t < 5))[:, None]
+    return Recording(f"rest_{seed}.csv", t, q + yields + 1e-5 * rng.normal(size=(len(t), 7)), tau=tau)
+
+
+def push(newtons: float, start: float = 3.0, stop: float = 5.0):
+    """On the last link, sideways."""
+    wrench = np.array([0.6, 0.8, 0, 0, 0, 0]) * newtons
+    return lambda t, at: ((t >= start) & (t < stop))[:, None] * (at.wrench_columns[0, 6] @ wrench)
+
+
+def hung(kilograms: float, start: float = -1.0):
+    """0.15 m before the flange's frame."""
+    phi = kilograms * np.array([1, 0, 0, 0.15])
+    return lambda t, at: (t >= start)[:, None] * (at.regressor[0][:, 60:64] @ phi)
+
+
+def judged(rubbing, *recordings: Recording, reference=()) -> AtRest:
+    arm, source = from_mjcf(rubbing)
+    ready = lambda some: [prepare(one, arm) for one in some]
+    return judge(ready(recordings), ready(reference), source, "identified")
+
+
+def test_an_arm_at_rest_is_answered_and_its_prediction_is_the_users_model(rubbing, tmp_path):
+    """It was refused with status 2, whatever its torque said."""
+    save(rest(0), tmp_path / "rest.csv")
+    out = tmp_path / "out"
+    command = [
+        "diagnose",
+        "--model",
+        str(rubbing),
+        "--recording",
+        str(tmp_path / "rest.csv"),
+        "--out",
+        str(out),
+    ]
+    assert main(command) == 0
+    document = json.loads((out / "diagnosis.json").read_text())
+    assert (document["verdict"], document["findings"]) == ("consistent", [])
+    assert any("no joint moves, so that none was judged" in note for note in document["notes"])
+    assert (out / "corrected.xml").read_text() == rubbing.read_text()
+    assert "No joint moved" in (out / "report.html").read_text()
+    arm, motion = from_mjcf(rubbing)[0], rest(1)
+    held = Motion(arm, motion.time, motion.q, *np.zeros((3, *motion.q.shape))).load
+    assert np.abs(predict(out, motion) - held).max() < LOSS + 0.05
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_noise_and_friction_at_rest_raise_no_alarm(rubbing, slow):
+    found = [judged(rubbing, rest(seed, slow=slow)) for seed in range(12)]
+    assert [one.verdict for one in found] == ["consistent"] * 12
+
+
+def test_what_friction_at_rest_may_carry_is_not_told(rubbing):
+    within = lambda t, at: 0.3 * LOSS * np.eye(7)[3] * (t[:, None] > 4)
+    assert not judged(rubbing, rest(3, within)).findings
+
+
+def test_a_push_is_told_with_its_time(rubbing):
+    found = judged(rubbing, rest(4, push(40.0)))
+    (one,) = [f for f in found.findings if f.intervals]
+    assert one.effect == "external_contact"
+    np.testing.assert_allclose(one.intervals, [(3.0, 5.0)], atol=0.25)
+    assert one.confidence > 0.6
+    assert one.confidence + sum(p for _, p in one.alternatives) <= 1 + 1e-9
+    assert found.verdict == "partly_explained"
+
+
+def test_an_arm_that_gives_way_by_milliradians_is_pushed_and_has_no_spring(rubbing):
+    found = judged(rubbing, rest(4, push(40.0), gives=6e-3))
+    assert [f.effect for f in found.findings if f.intervals] == ["external_contact"]
+    assert any("gave way by" in note for note in found.notes)
+
+
+def test_a_body_hung_on_while_the_arm_holds_still(rubbing):
+    (one,) = [f for f in judged(rubbing, rest(5, hung(2.5, 4.0))).findings if f.intervals]
+    assert one.effect == "payload_change"
+    np.testing.assert_allclose(one.intervals[0][0], 4.0, atol=0.25)
+    mass = next(p for p in one.parameters if p["name"] == "mass")
+    assert abs(mass["value"] - 2.5) < 2.5 * mass["std"]
+
+
+def test_a_body_held_in_several_poses_is_a_payload(rubbing):
+    found = judged(rubbing, *(rest(k, hung(2.5), pose=k) for k in (10, 11, 12, 13)))
+    (one,) = found.findings
+    assert one.effect == "payload"
+    assert one.intervals is None
+
+
+def test_what_healthy_recordings_of_the_same_pose_show_is_not_told(rubbing):
+    biased = lambda t, at: 6.0 * np.eye(7)[2] * np.ones((len(t), 1))
+    assert judged(rubbing, rest(20, biased)).findings
+    healthy = rest(21, biased, pose=20)
+    assert not judged(rubbing, rest(20, biased), reference=[healthy]).findings
+
+
+def test_a_torque_that_never_changes_says_nothing_at_rest(rubbing):
+    one = rest(22)
+    tau = one.tau.copy()
+    tau[:, 2] = 7.0
+    assert diagnose(rubbing, [dataclasses.replace(one, tau=tau)]).verdict == "consistent"
+
+
+def test_without_frictionloss_in_the_model_friction_is_one_of_the_explanations():
+    biased = lambda t, at: 1.5 * np.eye(7)[2] * np.ones((len(t), 1))
+    found = diagnose(None, [rest(23, biased)], knowledge="exact")
+    (one,) = found.findings
+    assert "coulomb_friction" in {one.effect, *(name for name, _ in one.alternatives)}
+    assert found.verdict == "partly_explained"
+    assert jnp.all(found.corrected.frictionloss_change == 0)
