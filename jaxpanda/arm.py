@@ -98,7 +98,7 @@ class Arm(eqx.Module):
             joint_names=tuple(document["joint_names"]),
             link_names=tuple(document["link_names"]),
             name=document["name"],
-            **{name: None if (x := document.get(name)) is None else jnp.asarray(x) for name in _OPTIONAL},
+            **{name: jnp.asarray(document[name]) for name in _OPTIONAL if document.get(name) is not None},  # pyright: ignore[reportArgumentType]
         )
 
     def unit(self, turning: str, joint: int | None = None) -> str:

@@ -129,7 +129,7 @@ def partly(state: State) -> bool:
 
 
 def titles(terms: Sequence[Term]) -> list[str]:
-    """What each term is called beside the others: a law that another one of its joint holds goes by that one's name."""
+    """What each term is called beside the others: a law that another of its joint may hold goes by that one."""
     out = []
     for term in terms:
         beside = (t.effect for t in terms if t is not term and t.effect.joints == term.effect.joints)

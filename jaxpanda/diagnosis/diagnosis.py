@@ -47,7 +47,7 @@ from .unnamed import BEYOND
 
 NEXT_MOTION = "next_motion.csv"
 LOOSE = 20.0
-"""Multiple of an identification's uncertainty up to which numbers are those of a poorer motion, and no finding."""
+"""Multiple of an identification's uncertainty up to which its motion was poorer: that is no finding."""
 UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""
 UNSURE, MISSED = 0.6, 2.0

@@ -2,10 +2,11 @@ r"""What a law may be off: no gear's friction, spring or sensor is quite the one
 
 $$\tau = B c + D \epsilon, \qquad \epsilon \sim N(0, 1)$$
 
-with a few columns D that are made from the law's own torque: copies of it that vary smoothly with what such laws
-depend on, each of the size `discrepancy` of the effect's class; what neighbouring shapes of the law would give; and,
-for dry friction, other ways to turn at a reversal: over other speeds, or over a distance, as a gear's bristles do.
-A law without them is believed to the last digit, and what it leaves is taken for a second effect.
+with a few columns D that are made from the law's own torque: copies of it that vary smoothly with what such
+laws depend on, each of the size `discrepancy` of the effect's class; what neighbouring shapes of the law would
+give; and, for dry friction, other ways to turn at a reversal: over other speeds, or over a distance, as a gear's
+bristles do. What no column describes is noise in proportion to the torque and to how fast it changes
+(`unresolved`). A law without either is believed to the last digit, and what it leaves passes for a second effect.
 
 References:
     Kennedy and O'Hagan, J. R. Stat. Soc. B 2001; Brynjarsdóttir and O'Hagan, Inverse Problems 2014.

@@ -76,8 +76,8 @@ def nuisance(
     scale: float = 1.0,
 ) -> tuple[list[Float[np.ndarray, "_time dof _n"]], int]:
     """The columns N of each recording, and how many of them are numbers of the model; the others are what its
-    friction may be off and noise of the encoders, which no knowledge takes away. `std`: of the noise [N m]; `scale`
-    multiplies the uncertainty of friction and rotors where it is "rough"."""
+    friction may be off and noise of the encoders, which no knowledge takes away. `std`: of the noise [N m];
+    `scale` multiplies the uncertainty of friction and rotors where it is "rough"."""
     arm = traces[0].motion.arm
     damping, level, armature = friction_spread(arm, knowledge, scale)
     out, numbers = [], 0
@@ -118,7 +118,7 @@ def changes(
     Float[np.ndarray, " dof"],
     Float[np.ndarray, " dof"],
 ]:
-    """What coefficients x of `nuisance` mean: changes of standard parameters, damping, frictionloss and armature."""
+    """What coefficients x of `nuisance` change: standard parameters, damping, frictionloss and armature."""
     inertial = spread.shape[1]
     standard = (spread @ x[:inertial]).reshape(arm.dof, 10)
     friction = []

@@ -255,8 +255,8 @@ def _added(x: _Sums, y: _Sums) -> _Sums:
 def _pair_sums(problem: Problem, noise: Noise, pair: _Pair) -> tuple[_Sums, _Sums]:
     """What a leaves for b to imitate, and the other way round."""
     base = []
-    for r, nuisance in enumerate(problem.nuisance):
-        columns = np.delete(nuisance, problem.known_off, axis=2)
+    for r, of_one in enumerate(problem.nuisance):
+        columns = np.delete(of_one, problem.known_off, axis=2)
         held = [_wide(problem, _Shapes((t.effect,)), r)[:, :, 0] for t in pair.others]
         base.append(np.concatenate([columns, *held], 2))
     A = [problem.whitened([c[:, j] for c in base], noise, j) for j in range(problem.dof)]
@@ -336,8 +336,8 @@ def _placed(
     knowledge: Knowledge,
     background: Sequence[Term] = (),
 ) -> list[Problem]:
-    """Motions on the grids of a recording, each as a problem of its own, without torque; the friction that the model
-    holds is taken for exact there."""
+    """Motions on the grids of a recording, each as a problem of its own, without torque; the friction that the
+    model holds is taken for exact there."""
     arm, dt = trace.motion.arm, trace.dt
     stride = int(trace.keep[1] - trace.keep[0])
     exact = np.full(arm.dof, np.inf)  # no law is taken for wrong

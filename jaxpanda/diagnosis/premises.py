@@ -5,9 +5,9 @@ Two premises come from the user: how well the model's numbers are known, and rec
 - What healthy recordings show beyond the model is no news. It is searched for in them alone first, and joins
   what may be refitted: else an effect that may act only in the suspect recordings would be credited with
   explaining half of something that both show.
-- Numbers may be known worse than the user says: a model that was identified by a poor motion, without friction, or
-  on another arm. `RUNGS` are such suppositions, each with its prior odds; they are compared like everything else,
-  and where one is likelier, with whatever effects it makes needless left out, the search is made again with it.
+- Numbers may be known worse than the user says: a model that was identified by a poor motion, without friction,
+  or on another arm. `RUNGS` are such suppositions, each with its prior odds; they are compared like everything
+  else, and where one is likelier, with whatever effects it makes needless left out, the search is made again.
 """
 
 import dataclasses
@@ -118,8 +118,8 @@ def _wider(premises: Premises, state: State) -> Premises | None:
     if best is None:
         return None
     told = f"{best.knowledge!r}" + (f", {best.scale:g} times" if best.scale != 1 else "")
-    note = f"the recordings contradict that the model's numbers are known as {premises.knowledge!r}: they were taken"
-    return dataclasses.replace(best, notes=(*premises.notes, f"{note} as {told}"))
+    note = f"the recordings contradict that the model's numbers are known as {premises.knowledge!r}"
+    return dataclasses.replace(best, notes=(*premises.notes, f"{note}: they were taken as {told}"))
 
 
 def _needed(problem: Problem, state: State) -> State:

@@ -144,8 +144,8 @@ class Problem:
         return slice(stop if self.numbers is None else self.numbers, stop)
 
     def explained(self, x: Float[np.ndarray, " n"], terms: Sequence[Term] = ()) -> Float[np.ndarray, " laws"]:
-        """Of a design's coefficients those of the nuisance and of the terms' laws, what belongs to a recording and
-        to no model set to zero: the encoders' noise, and what laws are off."""
+        """Of a design's coefficients those of the nuisance and of the terms' laws, what belongs to a recording
+        and to no model set to zero: the encoders' noise, and what laws are off."""
         count = self.nuisance[0].shape[2]
         nuisance = x[:count].copy()
         nuisance[self.shaken], nuisance[self.known_off] = 0.0, 0.0
@@ -161,7 +161,7 @@ class Problem:
         std: Float[np.ndarray, " dof"] | None = None,
         prior: float = 0.0,
     ) -> Term:
-        """The effect's columns in all recordings; with its discrepancy, where coefficients and noise are known."""
+        """The effect's columns in all recordings; with its discrepancy, if coefficients and noise are known."""
         columns = tuple(self.full_columns(effect))
         if c is None or std is None:
             return Term(effect, columns, deviation, prior=prior)
@@ -398,7 +398,7 @@ class Problem:
 
     @functools.cached_property
     def noise_scale(self) -> Float[np.ndarray, " dof"]:
-        """By how much each joint's noise was larger in the last model than a saturated one's; where the next begins."""
+        """How many times each joint's noise in the last model was a saturated one's; the next begins so."""
         return np.ones(self.dof)
 
     @functools.cached_property

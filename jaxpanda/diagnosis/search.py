@@ -1,10 +1,11 @@
 r"""Which effects, where, in which shape: the likeliest model that steps from one to the next lead to.
 
-A model is a set of terms. Its probability is its evidence, every law with its discrepancy, times the prior odds of
-its effects. Steps add a term, drop one, put another in its place, or one in the place of several; none of them knows
-an effect. What is left is a local optimum, and its neighbours, which `posterior` weighs.
+A model is a set of terms. Its probability is its evidence, every law with its discrepancy, times the prior odds
+of its effects. Steps add a term, drop one, put another or two in its place, or one in the place of several; none
+of them knows an effect. What is left is a local optimum, and its neighbours, which `posterior` weighs.
 """
 
+import dataclasses
 from collections.abc import Collection, Sequence
 from typing import Any
 
@@ -55,8 +56,8 @@ _SETTLED = 4
 def search(problem: Problem, log: list[str] | None = None) -> State:
     """The likeliest model that was found, from one beginning, or two where many effects are needed.
 
-    Where many are, the arm may be one whose every joint rubs and has an offset, as real ones do: the other beginning
-    is what is common in every joint.
+    Where many are, the arm may be one whose every joint rubs, as real ones do: the other beginning is what is
+    common in every joint.
     """
     say = log.append if log is not None else (lambda _: None)
     state = climb(problem, start(problem), say)
@@ -187,7 +188,8 @@ def merge(problem: Problem, state: State, say: Any) -> State:
 
 
 def instead(problem: Problem, state: State, i: int) -> list[Choice]:
-    """What each effect would bring in a term's place, where the term acts, its own among them; likeliest first."""
+    """What each effect would bring in a term's place, where the term acts, the likeliest first; the term itself
+    is among them."""
     others = tuple(t for k, t in enumerate(state.terms) if k != i)
     key = ("instead", *map(id, others), id(state.terms[i]), id(state.noise))
     cache = problem._cache
@@ -226,8 +228,8 @@ def _new(terms: Sequence[Term], proposals: Sequence[Proposal]) -> list[Proposal]
 
 
 def posterior(problem: Problem, state: State, i: int) -> dict[str, float]:
-    """Probability of each effect in a term's place, the other terms given: of models that have the term's effect, and
-    of others by their first; none at all takes the rest."""
+    """Probability of each effect in a term's place, the other terms given: of models that have the term's effect,
+    and of others by their first; none at all takes the rest."""
     found = instead(problem, state, i)
     weights = np.array([0.0, *(gained for gained, _ in found)]) / TEMPERATURE
     shares_ = np.exp(weights - scipy.special.logsumexp(weights))
@@ -263,8 +265,7 @@ def everywhere(problem: Problem, noise: Noise) -> list[Term]:
 
 
 def _with_prior(p: Proposal, places: int) -> Proposal:
-    import dataclasses
-
+    """A proposal at one of so many places."""
     return dataclasses.replace(p, evidence=p.evidence - np.log(places) + p.effect.prior)
 
 

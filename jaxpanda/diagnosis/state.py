@@ -44,21 +44,20 @@ def start(problem: Problem) -> State:
 def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
     r"""The model with these terms, its noise estimated anew.
 
-    What the model leaves of a joint beyond the noise is noise as well until something explains it: the variance is
-    not known, and a law is worth $\tfrac n2 \log$ of what it reduces it by. Else many laws would be called on to
-    explain together what none of them is.
+    What the model leaves of a joint beyond the noise is noise as well until something explains it: the variance
+    is not known, and a law is worth $\tfrac n2 \log$ of what it reduces it by. Else many laws would be called on
+    to explain together what none of them is.
     """
     noise = problem.noise(terms)
-    scale = problem.noise_scale
-    for _ in range(2):
-        state = in_noise(problem, terms, dataclasses.replace(noise, sigma=noise.sigma * scale))
-        beyond = mean_squares(state) * scale**2
-        steps = np.floor(np.log(np.maximum(beyond, 1.0)) / (2 * np.log(_STEP)))
-        found = _STEP**steps
-        if np.all(found == scale):
-            break
-        scale = problem.noise_scale[:] = found
-    return state
+    scaled = lambda scale: in_noise(problem, terms, dataclasses.replace(noise, sigma=noise.sigma * scale))
+    scale = problem.noise_scale.copy()
+    state = scaled(scale)
+    beyond = mean_squares(state) * scale**2
+    found = _STEP ** np.floor(np.log(np.maximum(beyond, 1.0)) / (2 * np.log(_STEP)))
+    if np.all(found == scale):
+        return state
+    problem.noise_scale[:] = found
+    return scaled(found)
 
 
 def in_noise(problem: Problem, terms: Sequence[Term], noise: Noise) -> State:
