@@ -340,7 +340,6 @@ class Backlash(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "backlash"
-    prior: ClassVar[float] = -31.0
     discrepancy: ClassVar[float] = 0.3
     varies_with: ClassVar[tuple[str, ...]] = ("moments",)
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
