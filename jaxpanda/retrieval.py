@@ -253,6 +253,8 @@ def retrieve(
     table = _identified(identification)
     arm = arm or _arm(table)
     boxes = _bounds(bounds, arm, table)
+    if arm is not None and arm.dof != boxes.dof:
+        arm = None  # bounds of other links say nothing of this arm's
     if weighting == "auto":
         weighting = "torque" if table.method in ("trajectory", "one_step") else "none"
     A, b = _equations(table, boxes.dof, weighting)

@@ -232,8 +232,8 @@ def test_two_joints_with_something_of_their_own_are_no_wrong_link_beyond_them():
 def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_hardly_believed():
     problem = posed(record(7, lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) == 1)))
     state = with_terms(problem, [problem.term(CoulombFriction(1, 0.01), np.array([0.5]))])
-    (sure,) = findings(problem, state, [False])
-    (lost,) = findings(problem, state, [True])
+    (sure,) = findings(problem, state, state, [False])
+    (lost,) = findings(problem, state, state, [True])
     assert (sure.effect, lost.effect) == ("coulomb_friction", "coulomb_friction")
     assert sure.confidence > 0.9
     assert lost.confidence <= MISLEADS
@@ -256,9 +256,11 @@ def test_what_acts_along_a_joint_that_slides_is_told_in_newtons_and_metres():
     rubs = lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) >= 5)
     problem = pose((prepare(record(7, rubs, arm=arm), arm),), (True,), "exact").problem
     terms = [problem.term(e, np.ones(1)) for e in (CoulombFriction(5, 0.01), CoulombFriction(6, 0.01))]
-    (both,) = findings(problem, with_terms(problem, terms), [False, False])
+    both_laws = with_terms(problem, terms)
+    (both,) = findings(problem, both_laws, both_laws, [False, False])
     assert [p["unit"] for p in both.parameters] == ["N·m", "rad/s", "N", "m/s"]
-    (slides,) = findings(problem, with_terms(problem, terms[1:]), [False])
+    alone = with_terms(problem, terms[1:])
+    (slides,) = findings(problem, alone, alone, [False])
     assert " N rms" in slides.summary
 
 
