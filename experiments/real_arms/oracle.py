@@ -61,10 +61,11 @@ def nested(found: Diagnosis, cutoff: float) -> float:
     error, size = 0.0, 0.0
     problem = found.problem
     for splits in signals.blocks_many([t.signals for t in problem.traces], FOLDS):
-        state = search(_without(problem, splits))
-        terms = [problem.term(t.effect, t.deviation) for t in state.terms]
+        rest = _without(problem, splits)
+        laws = with_terms(rest, [t.law for t in search(rest).terms])
+        terms = [problem.term(t.effect, t.deviation) for t in laws.terms]
         tests = [test for _, test in splits]
-        e, s = _squares(problem, terms, state.design.x, tests, cutoff)
+        e, s = _squares(problem, terms, laws.design.x, tests, cutoff)
         error, size = error + e, size + s
     return 100 * float(np.sqrt(error / size))
 
@@ -83,7 +84,7 @@ def _relative(problem: Problem, terms, fitted, cutoff: float) -> float:
 
 
 def _squares(problem: Problem, terms, x, tests, cutoff: float) -> tuple[float, float]:
-    error, size, x = 0.0, 0.0, problem.explained(x)
+    error, size, x = 0.0, 0.0, problem.explained(x, terms)
     for r, (trace, test) in enumerate(zip(problem.traces, tests, strict=True)):
         columns = np.concatenate([problem.nuisance[r], *(t.columns[r] for t in terms)], 2)
         assert trace.tau is not None

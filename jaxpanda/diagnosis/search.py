@@ -40,12 +40,14 @@ TEMPERATURE = 3.0
 quite what it is taken for, and counts as evidence what is none."""
 BETTER = 1.0
 """By how much a model must be likelier to be worth a step [nats]."""
+_NEGATIVE = 2.0
+"""Standard deviations by which a coefficient may be negative that cannot be."""
 _TRIED = 5
 """Proposals at most that are weighed with their discrepancy."""
 _WINDOW = 0.5
 """Share of the best proposal's log probability from which others are weighed beside it."""
-_PAIRED = 2
-"""Rivals of a term that are tried with another beside them."""
+_PAIRED, _FEW = 2, 8
+"""Rivals of a term that are tried with another beside them; terms of a model up to which they are."""
 _ROUNDS = 4
 _CROWDED = 4
 """Terms from which another beginning is tried."""
@@ -104,8 +106,18 @@ def choices(
     for p in some:
         term = taken(problem, design, noise, p)
         more = problem.design((*terms, term), noise)
-        out.append((more.log_evidence - own + term.prior, (term,)))
+        if is_possible(term, more):
+            out.append((more.log_evidence - own + term.prior, (term,)))
     return sorted(out, key=lambda choice: -choice[0])
+
+
+def is_possible(term: Term, design: Design) -> bool:
+    """Whether the coefficients of the last term of a design have the signs that physics allows, but for their noise."""
+    first = len(design.precision) - term.width
+    at = [first + k for k, c in enumerate(term.effect.coefficients) if c.sign]
+    unit = np.eye(len(design.precision))[:, at]
+    deviation = np.sqrt(np.diag(unit.T @ design.solve(unit)))
+    return bool(np.all(design.x[at] > -_NEGATIVE * deviation))
 
 
 def grow(problem: Problem, state: State, say: Any) -> State:
@@ -200,7 +212,7 @@ def instead(problem: Problem, state: State, i: int) -> list[Choice]:
         }  # fmt: skip
         proposals = _new(others, ranked(problem, rest, state.noise, acts))
         found = choices(problem, others, rest, state.noise, proposals) if proposals else []
-        if isinstance(term.effect, AbstractJointEffect):
+        if not term.effect.bound_to_recording and len(state.terms) <= _FEW:
             rivals = [choice for choice in found if choice[1][0].key != term.key][:_PAIRED]
             found += [
                 pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts))

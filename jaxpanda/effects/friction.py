@@ -164,7 +164,7 @@ class AsymmetricFriction(AbstractDryFriction):
     Zero at rest, which is what tells it from the offset of a torque sensor. Form "whole" has the first two parts,
     "viscous" the last two, "full" all and "both" all but damping; "... extra" leaves out the symmetric part, for
     a joint whose model holds it already. `grid` has no "full", which would take Coulomb's and viscous friction
-    for one law: the search tries it where "both" was found.
+    for one law: it is tried where "both" was found.
     """
 
     name: ClassVar[str] = "asymmetric_friction"
@@ -182,6 +182,10 @@ class AsymmetricFriction(AbstractDryFriction):
         forms = [("whole", 0.005), ("whole", 0.03), ("extra", 0.005), ("extra", 0.03)]
         forms += [("viscous", 0.01), ("viscous extra", 0.01), ("both", 0.005), ("both", 0.03)]
         return [cls(j, v0, form) for form, v0 in forms for j in range(arm.dof)]
+
+    def variants(self, arm: Arm) -> Sequence["AsymmetricFriction"]:
+        """With damping common to both directions."""
+        return [dataclasses.replace(self, form="full")] if self.form == "both" else []
 
     @property
     def may_hold(self) -> frozenset[str]:

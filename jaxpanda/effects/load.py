@@ -194,6 +194,13 @@ class PayloadChange(AbstractArmEffect):
     def grid(cls, arm: Arm) -> Sequence["PayloadChange"]:
         return []  # the event scan proposes them
 
+    def variants(self, arm: Arm) -> Sequence["PayloadChange"]:
+        """What begins or ends may also be where a body was gained or lost for good, other recordings included."""
+        edges = [float(at) for at in (self.start, self.stop) if abs(float(at)) < EVER]
+        lost = [dataclasses.replace(self, start=-EVER, stop=at, form="lost") for at in edges]
+        gained = [dataclasses.replace(self, start=at, stop=EVER, form="gained") for at in edges]
+        return [v for v in (*lost, *gained) if v.form != self.form]
+
     def placed(self, recording: str, later: bool | None) -> "PayloadChange | None":
         """A body gained stays for what is recorded later, one lost was there before."""
         if recording == self.recording:
