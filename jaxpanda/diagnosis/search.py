@@ -112,7 +112,7 @@ def choices(
 
 
 def is_possible(term: Term, design: Design) -> bool:
-    """Whether the coefficients of the last term of a design have the signs that physics allows, but for their noise."""
+    """Whether the coefficients of the last term of a design have the signs that physics allows, but for noise."""
     first = len(design.precision) - term.width
     at = [first + k for k, c in enumerate(term.effect.coefficients) if c.sign]
     unit = np.eye(len(design.precision))[:, at]
