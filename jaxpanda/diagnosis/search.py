@@ -48,7 +48,8 @@ _WINDOW = 0.5
 """Share of the best proposal's log probability from which others are weighed beside it."""
 _PAIRED, _FEW = 2, 8
 """Rivals of a term that are tried with another beside them; terms of a model up to which they are."""
-_ROUNDS = 4
+_ROUNDS, _MOST = 4, 60
+"""Rounds of steps, and terms of a model: nothing that ends by itself comes near."""
 _CROWDED = 4
 """Terms from which another beginning is tried."""
 _OVERLAP, _FELT = 0.05, 0.02
@@ -123,7 +124,7 @@ def is_possible(term: Term, design: Design) -> bool:
 def grow(problem: Problem, state: State, say: Any) -> State:
     """Add the likeliest effect while it makes the model likelier."""
     proposals, joints = [], None
-    while True:
+    while len(state.terms) < _MOST:
         proposals = ranked(problem, state.design, state.noise, joints, proposals)
         say(f"{len(state.terms)} terms: " + describe(proposals[:6]))
         held = {t.key for t in state.terms}
@@ -137,6 +138,7 @@ def grow(problem: Problem, state: State, say: Any) -> State:
         say(f"add {name(term)}: {gained:.1f}")
         state = settle(problem, with_terms(problem, (*state.terms, term)))
         joints = set(np.flatnonzero(shares(state)[-1] > _FELT).tolist())
+    return state
 
 
 def prune(problem: Problem, state: State, say: Any) -> State:
