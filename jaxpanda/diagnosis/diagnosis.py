@@ -234,7 +234,7 @@ def diagnose(
     written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
-        verdict=verdict(found, fitted, partly(state)),
+        verdict=verdict(found, fitted, partly(state) or not all(_judged(problem))),
         findings=found,
         fit=fitted,
         corrected=corrected,
@@ -280,6 +280,13 @@ def _turned(problem: Problem, state: State) -> list[str]:
         f"the model's friction at joint{'s' * (len(joints) > 1)} {', '.join(joints)} turns over another range of"
         " speeds than MuJoCo's constraint does, which is no finding (solreffriction and solimpfriction set it)"
     ]
+
+
+def _judged(problem: Problem) -> list[bool]:
+    """Whether each joint moved, and enough of its samples tell, in the recordings in question."""
+    suspect = [t for t, on in zip(problem.traces, problem.active, strict=True) if on]
+    moved = np.any([t.trust.any(0) for t in suspect], 0)
+    return [bool(moved[j]) and problem.saturation.tells(j) for j in range(problem.dof)]
 
 
 def _unheard(problem: Problem) -> list[str]:
@@ -358,7 +365,8 @@ def _rms(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
-    """The answer in a word; `partly`: whether structure is left that the findings do not explain."""
+    """The answer in a word; `partly`: whether structure is left that the findings do not explain, or that could not
+    be judged. Nothing is explained where held-out error does not fall."""
     names = [f.effect for f in found]
     if not names:
         return "consistent"
@@ -366,7 +374,13 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
         doubtful = any(f.confidence < DOUBTFUL for f in found)
         missed = bool(np.any(fit.held_out_rmse_after > MISSED * fit.noise_floor))
         unsure = missed and all(f.confidence < UNSURE for f in found)
-        return "partly_explained" if partly or doubtful or unsure else "explained"
+        before, after = (
+            np.sum(np.square(e / fit.noise_floor))
+            for e in (fit.held_out_rmse_before, fit.held_out_rmse_after)
+        )
+        events_alone = all(f.intervals is not None for f in found)  # no second instance to be tested on
+        helps = events_alone or after < before
+        return "partly_explained" if partly or doubtful or unsure or not helps else "explained"
     return "unexplained" if set(names) == {"unknown"} else "partly_explained"
 
 
