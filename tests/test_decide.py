@@ -291,9 +291,10 @@ def found_as(effect, i, confidence):
 
 def test_findings_that_are_not_sure_and_predict_poorly_explain_partly():
     noise, effect = np.full(7, 0.05), TorqueOffset(0)
-    poor, good = (Fit(noise, noise, noise, factor * noise, noise) for factor in (2.5, 1.5))
+    poor, good, worse = (Fit(noise, noise, 5 * noise, factor * noise, noise) for factor in (2.5, 1.5, 6.0))
     unsure = [found_as(effect, 0, 0.55), found_as(effect, 1, 0.5)]
     assert verdict(unsure, poor, False) == "partly_explained"
     assert verdict(unsure, good, False) == "explained"
     assert verdict([found_as(effect, 0, 0.9), unsure[1]], poor, False) == "explained"
     assert verdict([], poor, False) == "consistent"
+    assert verdict([found_as(effect, 0, 0.9)], worse, False) == "partly_explained"

@@ -374,10 +374,8 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
         doubtful = any(f.confidence < DOUBTFUL for f in found)
         missed = bool(np.any(fit.held_out_rmse_after > MISSED * fit.noise_floor))
         unsure = missed and all(f.confidence < UNSURE for f in found)
-        before, after = (
-            np.sum(np.square(e / fit.noise_floor))
-            for e in (fit.held_out_rmse_before, fit.held_out_rmse_after)
-        )
+        held_out = fit.held_out_rmse_before, fit.held_out_rmse_after
+        before, after = (np.sum(np.square(error / fit.noise_floor)) for error in held_out)
         events_alone = all(f.intervals is not None for f in found)  # no second instance to be tested on
         helps = events_alone or after < before
         return "partly_explained" if partly or doubtful or unsure or not helps else "explained"
