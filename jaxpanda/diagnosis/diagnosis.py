@@ -365,8 +365,8 @@ def _rms(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
-    """The answer in a word; `partly`: whether structure is left that the findings do not explain, or that could not
-    be judged. Nothing is explained where held-out error does not fall."""
+    """The answer in a word; `partly`: whether structure is left that the findings do not explain, or that could
+    not be judged. Nothing is explained where held-out error does not fall."""
     names = [f.effect for f in found]
     if not names:
         return "consistent"
