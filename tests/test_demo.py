@@ -20,6 +20,7 @@ def test_the_demo_finds_the_virtual_arm_and_leaves_its_files(tmp_path):
         "recording.csv",
         "held_out.csv",
         "identification.json",
+        "identification.npz",
         "retrieval.json",
         "starts.npz",
         "panda.xml",
