@@ -46,8 +46,6 @@ from .uncertainty import polished
 from .unnamed import BEYOND
 
 NEXT_MOTION = "next_motion.csv"
-LOOSE = 20.0
-"""Multiple of an identification's uncertainty up to which its motion was poorer: that is no finding."""
 UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""
 UNSURE, MISSED = 0.6, 2.0
@@ -217,7 +215,7 @@ def diagnose(
     kept = transferable(problem, laws)
     lost = [all(t is not k for k in kept.terms) for t in laws.terms]
     found = tuple(findings(problem, state, laws, lost))
-    contradicted = premises.knowledge != knowledge or premises.scale > LOOSE
+    contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
     wrong = numbers(problem, state, premises.changes) if contradicted else []
     found = (*found, *wrong)
     corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))

@@ -60,6 +60,7 @@ def of_law(
     weights = np.concatenate([t.weights for t in traces])
     count = np.maximum((weights**2).sum(0), 1.0)
     size = lambda x: np.sqrt(((weights * x) ** 2).sum(0) / count) / std
+    felt = size(stacked)
     columns: list[np.ndarray] = []
 
     def take(joint: int, values: Float[np.ndarray, "rows n"]) -> None:
@@ -67,11 +68,11 @@ def of_law(
         wide[:, joint] = values
         columns.append(wide)
 
-    for j in np.flatnonzero(effect.discrepancy * size(stacked) > SEEN):
+    for j in np.flatnonzero(effect.discrepancy * felt > SEEN):
         for channel in effect.varies_with:
             copies = effect.discrepancy * stacked[:, j, None] * _hats(traces, int(j), channel)
             take(int(j), copies)
-    if np.any(size(stacked) > SEEN):
+    if np.any(felt > SEEN):
         for other in neighbours(effect):
             off = SHAPE * (np.concatenate(evaluate(other)) - stacked)
             if np.any(size(off) > SEEN):
@@ -94,20 +95,21 @@ def unresolved(
 ) -> Float[np.ndarray, "rows dof"]:
     """Square of what a law may be off from sample to sample [N² m²]: in proportion to its torque, and to how fast
     that changes; dry friction at rest, by all of it."""
-    rates = [np.gradient(tau, t.motion.dt, axis=0) for t, tau in zip(traces, torque, strict=True)]
-    stacked = np.concatenate(torque)
-    off = np.square(UNRESOLVED * stacked) + np.square(TIMING * np.concatenate(rates))
+    off = _in_proportion(traces, torque)
     if effect.dry and isinstance(effect, AbstractJointEffect):
         j = effect.joints[0]
         rests = [np.zeros(t.motion.samples) if t.unsure is None else t.unsure[:, j] for t in traces]
-        off[:, j] += np.square(_level(stacked[:, j]) * np.concatenate(rests))
+        off[:, j] += np.square(_level(np.concatenate(torque)[:, j]) * np.concatenate(rests))
     return off
 
 
 def unresolved_known(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
     """The same of the friction that the user's model holds; where it rests `Trace.trust` says."""
     level = np.asarray(traces[0].motion.arm.frictionloss)
-    torque = [level * t.down(t.sign) for t in traces]
+    return _in_proportion(traces, [level * t.down(t.sign) for t in traces])
+
+
+def _in_proportion(traces: Sequence[Trace], torque: Torque) -> Float[np.ndarray, "rows dof"]:
     rates = [np.gradient(tau, t.motion.dt, axis=0) for t, tau in zip(traces, torque, strict=True)]
     return np.square(UNRESOLVED * np.concatenate(torque)) + np.square(TIMING * np.concatenate(rates))
 

@@ -64,8 +64,9 @@ def pose(
     arm = traces[0].motion.arm
     nothing = tuple(t.motion.q[:, :, None][:, :, :0] for t in traces)
     empty = Problem(traces, active, nothing, saturated=saturated)
-    spread = scale * knowledge_.inertial_spread(arm, knowledge, empty.noise(()).std)
-    columns, numbers = knowledge_.nuisance(traces, spread, knowledge, empty.noise(()).std, scale)
+    std = empty.noise(()).std
+    spread = scale * knowledge_.inertial_spread(arm, knowledge, std)
+    columns, numbers = knowledge_.nuisance(traces, spread, knowledge, std, scale)
     problem = posed(traces, active, columns, background, empty.saturation, numbers)
     return Premises(problem, spread, knowledge, scale, problem.background)
 

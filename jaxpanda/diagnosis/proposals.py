@@ -52,8 +52,7 @@ def ranked(
         times = 1 + (
             held[p.key[0]] if p.effect.repeats else 0
         )  # the third push is less likely than the first
-        prior = times * p.effect.prior - np.log(many[p.key[0]])
-        p = dataclasses.replace(p, evidence=p.evidence + prior)
+        p = with_prior(p, many[p.key[0]], times)
         if p.key not in best or p.evidence > best[p.key].evidence:
             best[p.key] = p
     order = sorted(best.values(), key=lambda p: -p.evidence)
@@ -61,6 +60,12 @@ def ranked(
     refined = parallel(lambda p: refine(problem, design, noise, p), order[:close])
     found = [p for p in (*refined, *order[close:]) if is_credible(problem, design, noise, p)]
     return sorted(found, key=lambda p: -p.evidence)
+
+
+def with_prior(proposal: Proposal, places: int, times: int = 1) -> Proposal:
+    """A proposal with what was thought of it beforehand, at one of so many places and for so many times."""
+    prior = times * proposal.effect.prior - float(np.log(places))
+    return dataclasses.replace(proposal, evidence=proposal.evidence + prior)
 
 
 def is_elsewhere(effect: AbstractEffect, joints: Collection[int]) -> bool:

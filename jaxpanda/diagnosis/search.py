@@ -5,7 +5,6 @@ of its effects. Steps add a term, drop one, put another or two in its place, or 
 of them knows an effect. What is left is a local optimum, and its neighbours, which `posterior` weighs.
 """
 
-import dataclasses
 from collections.abc import Collection, Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from .credible import fitted
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem, Term
-from .proposals import grids, ranked
+from .proposals import grids, ranked, with_prior
 from .shapes import evidence_of, first_steps, refine
 from .state import (
     State,
@@ -101,6 +100,8 @@ def choices(
     problem: Problem, terms: Sequence[Term], design: Design, noise: Noise, proposals: Sequence[Proposal]
 ) -> list[Choice]:
     """What the foremost proposals bring with their discrepancies, beside these terms; the likeliest first."""
+    if not proposals:
+        return []
     own = design.log_evidence
     some = [p for p in proposals if p.evidence > _WINDOW * max(proposals[0].evidence, 0.0)][:_TRIED]
     out = []
@@ -213,7 +214,7 @@ def instead(problem: Problem, state: State, i: int) -> list[Choice]:
             int(j) for j in np.flatnonzero(shares(state)[i] > _FELT)
         }  # fmt: skip
         proposals = _new(others, ranked(problem, rest, state.noise, acts))
-        found = choices(problem, others, rest, state.noise, proposals) if proposals else []
+        found = choices(problem, others, rest, state.noise, proposals)
         if not term.effect.bound_to_recording and len(state.terms) <= _FEW:
             rivals = [choice for choice in found if choice[1][0].key != term.key][:_PAIRED]
             found += [
@@ -232,7 +233,7 @@ def _with_another(
     terms = (*others, *choice[1])
     design = problem.design(terms, noise)
     proposals = [p for p in _new(terms, ranked(problem, design, noise, joints)) if p.evidence > 0]
-    found = choices(problem, terms, design, noise, proposals) if proposals else []
+    found = choices(problem, terms, design, noise, proposals)
     return (choice[0] + found[0][0], (*choice[1], *found[0][1])) if found and found[0][0] > 0 else None
 
 
@@ -269,18 +270,13 @@ def everywhere(problem: Problem, noise: Noise) -> list[Term]:
             left = [g for g in groups if (g.name, g.effects[0].joints) not in held]
             found = []
             for p in grids(problem, design, noise, left) if left else []:
-                p = refine(problem, design, noise, _with_prior(p, problem.dof))
+                p = refine(problem, design, noise, with_prior(p, problem.dof))
                 found += choices(problem, terms, design, noise, [p]) if p.evidence > 0 else []
             best = max(found, key=lambda choice: choice[0], default=None)
             if best is None or best[0] < BETTER:
                 break
             terms += best[1]
     return terms
-
-
-def _with_prior(p: Proposal, places: int) -> Proposal:
-    """A proposal at one of so many places."""
-    return dataclasses.replace(p, evidence=p.evidence - np.log(places) + p.effect.prior)
 
 
 def settle(problem: Problem, state: State) -> State:
