@@ -20,7 +20,7 @@ from . import knowledge as knowledge_
 from .noise import Saturation
 from .problem import Problem, Term, posed
 from .search import search
-from .state import State, gains, in_noise
+from .state import State, gains, in_noise, likelier
 from .traces import Trace
 
 RUNGS: tuple[tuple[knowledge_.Knowledge, float, float], ...] = (
@@ -93,7 +93,9 @@ def settled(
     while (wider := _wider(premises, state)) is not None:
         log.append(f"the model's numbers as {wider.knowledge!r}, {wider.scale:g} times: searched again")
         other = search(wider.problem, log)
-        gained = other.score + _price(wider) - state.score - _price(premises)
+        gained = (
+            likelier((premises.problem, state), (wider.problem, other)) + _price(wider) - _price(premises)
+        )
         log.append(f"which is likelier by {gained:.1f}")
         if gained <= 0:
             break

@@ -255,6 +255,16 @@ class Problem:
         return {}
 
     @functools.cached_property
+    def likeliest_shapes(self) -> dict[tuple, AbstractEffect]:
+        """Where searches over the shapes of an effect at a place have ended last."""
+        return {}
+
+    @functools.cached_property
+    def tried(self) -> dict[tuple, Any]:
+        """Steps of a search that have been tried, and with what."""
+        return {}
+
+    @functools.cached_property
     def _scanned(self) -> list:
         return []
 
@@ -370,24 +380,33 @@ class Problem:
         """Squared error of predicted torque, over the noise's deviation, where coefficients were not fitted: with
         the model of the design, and with the user's.
 
-        In other recordings, or in other blocks of the only one. Not whitened: as whoever takes the model to
-        predict torque would see it, slow errors count in full, and what was put down to the encoders' noise does
-        not help.
+        In other recordings, or in other blocks of the only one.
         """
         of = np.repeat(np.arange(len(self.traces)), [t.motion.samples for t in self.traces])
         folds = [(of != r, of == r) for r, on in enumerate(self.active) if on]
         if len(folds) == 1:
             folds = self.spread_folds if spread else self.folds
         weight = np.concatenate([t.weights for t in self.traces]) / noise.std
+        tested = np.any([test for _, test in folds], 0)
+        users = weight * np.concatenate(self.residual)
+        left = self._mispredicted(design, folds) / noise.std
+        return float(np.sum(left**2)), float(np.sum(users[tested] ** 2))
+
+    def mispredicted(self, design: Design, *, spread: bool = False) -> Float[np.ndarray, "rows dof"]:
+        """Torque that a model gets wrong on blocks that its coefficients were not fitted to [N m]; zero in rows
+        that do not count."""
+        return self._mispredicted(design, self.spread_folds if spread else self.folds)
+
+    def _mispredicted(self, design: Design, folds: Sequence) -> Float[np.ndarray, "rows dof"]:
+        """Not whitened: as whoever takes the model to predict torque would see it, slow errors count in full, and
+        what was put down to the encoders' noise does not help."""
         residual = np.concatenate(self.residual)
         parts = zip(self.nuisance, *(t.columns for t in design.terms), strict=True)
         columns = np.concatenate([np.concatenate(part, 2) for part in parts])
-        corrected = users = 0.0
+        out = np.zeros_like(residual)
         for (_, test), x in zip(folds, _left_out(design, folds), strict=True):
-            left = residual[test] - columns[test] @ self.explained(x, design.terms)
-            corrected += float(np.sum((weight[test] * left) ** 2))
-            users += float(np.sum((weight[test] * residual[test]) ** 2))
-        return corrected, users
+            out[test] = residual[test] - columns[test] @ self.explained(x, design.terms)
+        return out * np.concatenate([t.weights for t in self.traces])
 
     @functools.cached_property
     def saturation(self) -> Saturation:

@@ -15,9 +15,12 @@ from .library import Candidates
 from .problem import Problem
 from .shapes import first_steps, refine
 
-_REFINED = 7
-_CLOSE = 0.3
-"""Proposals that are refined at most, and the share of the best one's evidence from which they are."""
+_REFINED = 4
+_CLOSE, _HOPELESS = 0.5, 5.0
+"""Proposals of a joint that are refined at most; from which share of its best one's evidence they are,
+and how much less it may be [nats]."""
+_AHEAD = 2.0
+"""How many times the evidence of earlier events another effect's must be for their scan to wait."""
 
 
 def ranked(
@@ -35,7 +38,7 @@ def ranked(
         design: what is in the model.
         noise: to weigh by.
         joints: where effects of single joints are scanned; None for all.
-        before: an earlier scan's, to be taken for other joints; those in front are weighed again.
+        before: an earlier scan's, to be taken for other joints as they are.
     """
     where = range(problem.dof) if joints is None else sorted(joints)
     here = [g for g in (*problem.library, *problem.catchalls) if g.joint is None or g.joint in where]
@@ -43,11 +46,17 @@ def ranked(
         *grids(problem, design, noise, here),
         *spots(problem, design, noise, where),
         *ripple(problem, design, noise, where),
-        *(windows(problem, design, noise) if len(where) > 1 or joints is None or before else ()),
     ]
+    kept = [p for p in before if is_elsewhere(p.effect, where)]
+    events = [p for p in before if p.effect.bound_to_recording]
+    likeliest = max((p.evidence for p in scanned), default=0.0)
+    if events and likeliest > _AHEAD * max(0.0, *(p.evidence for p in events)):
+        kept += events
+    elif len(where) > 1 or joints is None or before:
+        scanned += windows(problem, design, noise)
     many = _places(problem)
     held = Counter(t.effect.name for t in design.terms)
-    best: dict[tuple, Proposal] = {p.key: p for p in before if is_elsewhere(p.effect, where)}
+    best: dict[tuple, Proposal] = {}
     for p in scanned:
         times = 1 + (
             held[p.key[0]] if p.effect.repeats else 0
@@ -55,11 +64,23 @@ def ranked(
         p = with_prior(p, many[p.key[0]], times)
         if p.key not in best or p.evidence > best[p.key].evidence:
             best[p.key] = p
-    order = sorted(best.values(), key=lambda p: -p.evidence)
-    close = sum(p.evidence > _CLOSE * order[0].evidence - 10 for p in order[:_REFINED])
-    refined = parallel(lambda p: refine(problem, design, noise, p), order[:close])
-    found = [p for p in (*refined, *order[close:]) if is_credible(problem, design, noise, p)]
+    first, rest = [], kept
+    for alike in by_place(sorted(best.values(), key=lambda p: -p.evidence)).values():
+        close = sum(p.evidence > _CLOSE * alike[0].evidence - _HOPELESS for p in alike[:_REFINED])
+        first += alike[:close]
+        rest += alike[close:]
+    refined = parallel(lambda p: refine(problem, design, noise, p), first)
+    found = [p for p in (*refined, *rest) if is_credible(problem, design, noise, p)]
     return sorted(found, key=lambda p: -p.evidence)
+
+
+def by_place(proposals: Sequence[Proposal]) -> dict[int | None, list[Proposal]]:
+    """Those of each joint, in their order; under None those that act in several."""
+    out: dict[int | None, list[Proposal]] = {}
+    for p in proposals:
+        joint = p.effect.joints[0] if isinstance(p.effect, AbstractJointEffect) else None
+        out.setdefault(joint, []).append(p)
+    return out
 
 
 def with_prior(proposal: Proposal, places: int, times: int = 1) -> Proposal:

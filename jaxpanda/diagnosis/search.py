@@ -16,15 +16,15 @@ from .credible import fitted
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem, Term
-from .proposals import grids, ranked, with_prior
+from .proposals import by_place, grids, ranked, with_prior
 from .shapes import evidence_of, first_steps, refine
 from .state import (
     State,
     gains,
     in_noise,
+    likelier,
     overlaps,
     places,
-    shares,
     start,
     with_terms,
     without,
@@ -56,29 +56,38 @@ _SETTLED = 4
 
 
 def search(problem: Problem, log: list[str] | None = None) -> State:
-    """The likeliest model that was found, from one beginning, or two where many effects are needed.
+    """The likeliest model that was found.
 
-    Where many are, the arm may be one whose every joint rubs, as real ones do: the other beginning is what is
+    Laws come before free forms, which fit what several laws do together and hold nowhere else. Where many laws
+    are needed the arm may be one whose every joint rubs, as real ones do: another search begins at what is
     common in every joint.
     """
     say = log.append if log is not None else (lambda _: None)
-    state = climb(problem, start(problem), say)
-    if len(state.terms) < _CROWDED:
+    state = climb(problem, start(problem), say, free=False)
+    if len(state.terms) >= _CROWDED:
+        say("another beginning: what is common, at all joints")
+        common = with_terms(problem, everywhere(problem, state.noise))
+        state = _likelier(problem, state, climb(problem, common, say, free=False), say)
+    say("free forms")
+    return _likelier(problem, state, climb(problem, state, say), say)
+
+
+def _likelier(problem: Problem, state: State, other: State, say: Any) -> State:
+    """Of two models the likelier one."""
+    if {id(t) for t in state.terms} == {id(t) for t in other.terms}:
         return state
-    say("another beginning: what is common, at all joints")
-    other = climb(problem, with_terms(problem, everywhere(problem, state.noise)), say)
-    gained = other.score - state.score
+    gained = likelier((problem, state), (problem, other))
     say(f"which is likelier by {gained:.1f}")
     return other if gained > 0 else state
 
 
-def climb(problem: Problem, state: State, say: Any) -> State:
-    """Steps to a likelier model, as long as there are any."""
+def climb(problem: Problem, state: State, say: Any, *, free: bool = True) -> State:
+    """Steps to a likelier model, as long as there are any; with free forms, or laws only."""
     for _ in range(_ROUNDS):
         before = state
-        state = prune(problem, grow(problem, state, say), say)
-        state = exchange(problem, state, say)
-        state = merge(problem, state, say)
+        state = prune(problem, grow(problem, state, say, free), say)
+        state = exchange(problem, state, say, free)
+        state = merge(problem, state, say, free)
         state = prune(problem, state, say)
         if {id(t) for t in state.terms} == {id(t) for t in before.terms}:
             break
@@ -122,24 +131,39 @@ def is_possible(term: Term, design: Design) -> bool:
     return bool(np.all(design.x[at] > -_NEGATIVE * deviation))
 
 
-def grow(problem: Problem, state: State, say: Any) -> State:
-    """Add the likeliest effect while it makes the model likelier."""
+def grow(problem: Problem, state: State, say: Any, free: bool) -> State:
+    """Add the likeliest effect while it makes the model likelier, and with it the likeliest at other joints."""
     proposals, joints = [], None
     while len(state.terms) < _MOST:
         proposals = ranked(problem, state.design, state.noise, joints, proposals)
         say(f"{len(state.terms)} terms: " + describe(proposals[:6]))
-        held = {t.key for t in state.terms}
-        new = [p for p in proposals if p.evidence > 0 and (p.key not in held or p.effect.repeats)]
-        if not new:
+        new = [p for p in _new(state.terms, proposals, free) if p.evidence > 0]
+        added = foremost(problem, state, new)
+        if not added:
             return state
-        found = choices(problem, state.terms, state.design, state.noise, new)
-        if not found or found[0][0] < BETTER:
-            return state
-        gained, (term,) = found[0]
-        say(f"add {name(term)}: {gained:.1f}")
-        state = settle(problem, with_terms(problem, (*state.terms, term)))
-        joints = set(np.flatnonzero(shares(state)[-1] > _FELT).tolist())
+        for gained, (term,) in added:
+            say(f"add {name(term)}: {gained:.1f}")
+        state = with_terms(problem, (*state.terms, *(term for _, (term,) in added)))
+        state = settle(problem, state, len(added))
+        joints = set(np.flatnonzero(state.shares[-len(added) :].max(0) > _FELT).tolist())
     return state
+
+
+def foremost(problem: Problem, state: State, proposals: Sequence[Proposal]) -> list[Choice]:
+    """The choice that is likeliest; where it acts in one joint, with it those of other joints that come before
+    any that acts in several: neither knows much of the other."""
+    weigh = lambda some: choices(problem, state.terms, state.design, state.noise, some)[:1]
+    first = weigh(proposals)
+    if not first or first[0][0] < BETTER:
+        return []
+    term, out = first[0][1][0], list(first)
+    if isinstance(term.effect, AbstractJointEffect):
+        places = by_place(proposals)
+        least = max((p.evidence for p in places.pop(None, [])), default=0.0)
+        del places[term.effect.joints[0]]
+        for alike in places.values():
+            out += [choice for choice in weigh(alike) if choice[0] > max(least, BETTER)]
+    return out
 
 
 def prune(problem: Problem, state: State, say: Any) -> State:
@@ -154,10 +178,12 @@ def prune(problem: Problem, state: State, say: Any) -> State:
     return state
 
 
-def exchange(problem: Problem, state: State, say: Any) -> State:
+def exchange(problem: Problem, state: State, say: Any, free: bool) -> State:
     """Put in the place of each term what is likelier there."""
     for i in range(len(state.terms)):
-        own, best = gains(state)[i], instead(problem, state, i)[0]
+        if not _is_new(problem, ("exchange", free), state, (i,)):
+            continue
+        own, best = gains(state)[i], instead(problem, state, i, free)[0]
         if best[0] > own + BETTER:
             if [t.key for t in best[1]] != [state.terms[i].key]:
                 said = ", ".join(map(name, best[1]))
@@ -166,9 +192,20 @@ def exchange(problem: Problem, state: State, say: Any) -> State:
     return state
 
 
-def merge(problem: Problem, state: State, say: Any) -> State:
+def _is_new(problem: Problem, step: tuple[str, bool], state: State, which: Sequence[int]) -> bool:
+    """Whether a step has not been tried yet with these terms, beside the others that act in the same joints."""
+    share = state.shares
+    near = (share @ share[list(which)].T).max(1) > _OVERLAP
+    terms = [state.terms[i] for i in which], [t for t, on in zip(state.terms, near, strict=True) if on]
+    key = *step, *(tuple(sorted(map(id, some))) for some in terms)
+    if key in problem.tried:
+        return False
+    problem.tried[key] = terms  # kept, lest its identities be used again
+    return True
+
+
+def merge(problem: Problem, state: State, say: Any, free: bool) -> State:
     """One term in the place of several that act together: of all in a joint, or of a pair."""
-    tried: set[tuple[int, ...]] = set()
     while True:
         groups = [
             tuple(i for i, t in enumerate(state.terms) if t.effect.joints == (j,)) for j in range(problem.dof)
@@ -176,10 +213,8 @@ def merge(problem: Problem, state: State, say: Any) -> State:
         wide = [i for i, t in enumerate(state.terms) if not isinstance(t.effect, AbstractJointEffect)]
         pairs = [p for p in overlaps(state) if set(p) <= set(wide)]
         for group in dict.fromkeys((*(g for g in groups if len(g) > 1), *pairs)):
-            which = tuple(sorted(id(state.terms[i]) for i in group))
-            if which in tried:
+            if not _is_new(problem, ("merge", free), state, group):
                 continue
-            tried.add(which)
             others = tuple(t for i, t in enumerate(state.terms) if i not in group)
             design = problem.design(others, state.noise)
             own = state.design.log_evidence - design.log_evidence + sum(state.terms[i].prior for i in group)
@@ -191,34 +226,36 @@ def merge(problem: Problem, state: State, say: Any) -> State:
                 others,
                 design,
                 state.noise,
-                _new(others, ranked(problem, design, state.noise, joints)),
+                _new(others, ranked(problem, design, state.noise, joints), free),
             )
             if found and found[0][0] > own + BETTER:
                 gone = ", ".join(name(state.terms[i]) for i in group)
                 say(f"{name(found[0][1][0])} for {gone}: {found[0][0]:.1f} for {own:.1f}")
-                state = grow(problem, with_terms(problem, (*others, *found[0][1])), say)
+                state = grow(problem, with_terms(problem, (*others, *found[0][1])), say, free)
                 break
         else:
             return state
 
 
-def instead(problem: Problem, state: State, i: int) -> list[Choice]:
+def instead(problem: Problem, state: State, i: int, free: bool = True) -> list[Choice]:
     """What each effect would bring in a term's place, where the term acts, the likeliest first; the term itself
     is among them."""
     others = tuple(t for k, t in enumerate(state.terms) if k != i)
-    key = ("instead", *map(id, others), id(state.terms[i]), id(state.noise))
+    key = ("instead", free, *map(id, others), id(state.terms[i]), id(state.noise))
     cache = problem._cache
     if key not in cache:
         term, rest = state.terms[i], without(state, i)
         acts = set(term.effect.joints) if isinstance(term.effect, AbstractJointEffect) else {
-            int(j) for j in np.flatnonzero(shares(state)[i] > _FELT)
+            int(j) for j in np.flatnonzero(state.shares[i] > _FELT)
         }  # fmt: skip
-        proposals = _new(others, ranked(problem, rest, state.noise, acts))
+        proposals = _new(others, ranked(problem, rest, state.noise, acts), free)
         found = choices(problem, others, rest, state.noise, proposals)
         if not term.effect.bound_to_recording and len(state.terms) <= _FEW:
             rivals = [choice for choice in found if choice[1][0].key != term.key][:_PAIRED]
             found += [
-                pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts))
+                pair
+                for one in rivals
+                if (pair := _with_another(problem, others, state.noise, one, acts, free))
             ]
         own = state.design.log_evidence - rest.log_evidence + term.prior
         found = sorted([(own, (term,)), *found], key=lambda choice: -choice[0])
@@ -227,19 +264,25 @@ def instead(problem: Problem, state: State, i: int) -> list[Choice]:
 
 
 def _with_another(
-    problem: Problem, others: Sequence[Term], noise: Noise, choice: Choice, joints: Collection[int]
+    problem: Problem,
+    others: Sequence[Term],
+    noise: Noise,
+    choice: Choice,
+    joints: Collection[int],
+    free: bool,
 ) -> Choice | None:
     """A choice and what is likeliest beside it in the same joints; None where nothing is."""
     terms = (*others, *choice[1])
     design = problem.design(terms, noise)
-    proposals = [p for p in _new(terms, ranked(problem, design, noise, joints)) if p.evidence > 0]
+    proposals = [p for p in _new(terms, ranked(problem, design, noise, joints), free) if p.evidence > 0]
     found = choices(problem, terms, design, noise, proposals)
     return (choice[0] + found[0][0], (*choice[1], *found[0][1])) if found and found[0][0] > 0 else None
 
 
-def _new(terms: Sequence[Term], proposals: Sequence[Proposal]) -> list[Proposal]:
+def _new(terms: Sequence[Term], proposals: Sequence[Proposal], free: bool) -> list[Proposal]:
+    """Proposals that may join these terms: free forms too, or laws only."""
     held = {t.key for t in terms}
-    return [p for p in proposals if p.key not in held or p.effect.repeats]
+    return [p for p in proposals if (p.key not in held or p.effect.repeats) and (free or not p.effect.free)]
 
 
 def posterior(problem: Problem, state: State, i: int) -> dict[str, float]:
@@ -279,26 +322,31 @@ def everywhere(problem: Problem, noise: Noise) -> list[Term]:
     return terms
 
 
-def settle(problem: Problem, state: State) -> State:
-    """The newest term refined again in its own noise, then the older ones beside it that act where it does."""
-    share = shares(state)
-    overlapping = [i for i in range(len(share)) if share[i] @ share[-1] > _OVERLAP]
-    for i in overlapping[::-1][:_SETTLED]:
-        term = state.terms[i]
-        if not term.effect.shapes:
-            continue
-        design = without(state, i)
-        best, deviation = evidence_of(problem, design, state.noise, term.effect)
-        steps = tuple(0.5 * x for x in first_steps(term.effect))
-        paid = term.prior - term.effect.form_prior
-        better = refine(
-            problem, design, state.noise, Proposal(term.effect, best + paid, best, deviation, steps)
-        )
-        if better.best > best + BETTER:
-            terms = list(state.terms)
-            terms[i] = taken(problem, design, state.noise, better)
-            state = in_noise(problem, terms, state.noise)
+def settle(problem: Problem, state: State, count: int = 1) -> State:
+    """The newest terms refined again in their own noise, and the older ones that act where they do."""
+    share = state.shares
+    for newest in range(len(share) - count, len(share)):
+        older = [i for i in range(len(share) - count) if share[i] @ share[newest] > _OVERLAP]
+        for i in (newest, *older[::-1][: _SETTLED - 1]):
+            state = settled(problem, state, i)
     return state
+
+
+def settled(problem: Problem, state: State, i: int) -> State:
+    """The model with the shape of a term refined again, where that makes it likelier."""
+    term = state.terms[i]
+    if not term.effect.shapes:
+        return state
+    design = without(state, i)
+    best, deviation = evidence_of(problem, design, state.noise, term.effect)
+    steps = tuple(0.5 * x for x in first_steps(term.effect))
+    paid = term.prior - term.effect.form_prior
+    better = refine(problem, design, state.noise, Proposal(term.effect, best + paid, best, deviation, steps))
+    if better.best < best + BETTER:
+        return state
+    terms = list(state.terms)
+    terms[i] = taken(problem, design, state.noise, better)
+    return in_noise(problem, terms, state.noise)
 
 
 def transferable(problem: Problem, state: State) -> State:

@@ -85,6 +85,8 @@ class AbstractEffect(eqx.Module):
     varies_with: ClassVar[tuple[str, ...]] = ("q", "qd", "t")
     """What that share varies with: the joint's position, its velocity, the clock; "moments" is a clock of short
     periods, for what comes and goes."""
+    free: ClassVar[bool] = False
+    """Whether it is a curve that fits what has no law."""
     repeats: ClassVar[bool] = False
     """Whether it can act several times over at one place."""
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "plant"

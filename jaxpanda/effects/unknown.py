@@ -47,6 +47,7 @@ class Unknown(AbstractInstantEffect):
 
     name: ClassVar[str] = "unknown"
     prior: ClassVar[float] = FREE
+    free: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
     reveals: ClassVar[str] = "single-joint motions that vary the channel it depends on and nothing else"
 
@@ -144,6 +145,7 @@ class UnknownOfTwo(AbstractInstantEffect):
 
     name: ClassVar[str] = "unknown"
     prior: ClassVar[float] = FREE
+    free: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
     reveals: ClassVar[str] = Unknown.reveals
 
@@ -186,6 +188,7 @@ class UnknownAt(AbstractDryFriction):
 
     name: ClassVar[str] = "unknown"
     prior: ClassVar[float] = FREE
+    free: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (
         Shape("place", "rad", -np.inf, np.inf, logarithmic=False),
