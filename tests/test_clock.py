@@ -57,6 +57,15 @@ def test_uniform_samples_are_put_on_their_ticks(rate, jitter):
     assert "samples were uniform and their stamps were not" in made.notes[-1]
 
 
+@pytest.mark.parametrize("jitter", [0.008, 0.015])
+def test_less_than_a_hundredth_of_a_sample_matters_at_a_low_rate(jitter):
+    """Encoders of 10 µrad show it at 20 ms: such a file was refused as off, and a clock fits it."""
+    recording, ticks = jittery(50.0, jitter)
+    made = on_clock(recording)
+    np.testing.assert_allclose(made.time, ticks, atol=0.1 * jitter / 50.0)
+    assert acceleration_error(made) < 0.6 * acceleration_error(recording)
+
+
 def test_the_error_that_jitter_makes_is_one_that_matters():
     assert acceleration_error(jittery(50.0, 0.1)[0]) > 0.2
     assert acceleration_error(jittery(50.0, 0.45)[0]) > 1.0

@@ -24,7 +24,9 @@ from .recording import Recording
 MOVED = "rows moved from their stamp to their tick"
 """What the account of repairs says."""
 JITTER = 0.01
-"""Stamps that stay this close to ticks, as a share of the period (rms), do no harm."""
+"""Stamps that stay this close to ticks, as a share of the period (rms), do no harm, unless q shows otherwise."""
+_EXACT = 0.001
+"""How close steps of stamps are to whole periods where no clock is looked for, as a share of one."""
 FEW = 40
 """Rows below which no clock is looked for."""
 _AROUND = 0.07
@@ -90,7 +92,7 @@ def on_clock(recording: Recording) -> Recording:
     t, q = recording.time, recording.q
     if recording.samples < FEW or _is_regular(t):
         return recording
-    clocks = [clock for clock in _clocks(t, q) if clock.jitter > JITTER]
+    clocks = [clock for clock in _clocks(t, q) if clock.jitter > JITTER or clock.left < _MENDED]
     sure = [clock for clock in clocks if clock.uniform]
     if not sure:
         shown = next((clock for clock in clocks if clock.seen - _SURE * clock.std > 0.5), None)
@@ -125,7 +127,7 @@ def _is_regular(time: Float[np.ndarray, " time"]) -> bool:
     """Whether stamps are ticks already, but for whole ones that are missing."""
     steps = np.diff(time)
     period = float(np.median(steps))
-    return bool(np.all(np.abs(steps - np.round(steps / period) * period) <= JITTER * period))
+    return bool(np.all(np.abs(steps - np.round(steps / period) * period) <= _EXACT * period))
 
 
 def _clocks(time: Float[np.ndarray, " time"], q: Float[np.ndarray, "time dof"]) -> list[Clock]:
