@@ -1,13 +1,14 @@
 """Whether a proposal is what it calls itself, beyond having evidence."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import Backlash
-from ..effects.friction import AsymmetricFriction, FrictionDrift
-from ..effects.sensing import TorqueDrift
+from ..effects.friction import AsymmetricFriction
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem
@@ -20,6 +21,8 @@ CLEAR = 4.0
 """Standard deviations by which a gap must differ from none."""
 AFRESH = 0.1
 """What of a drift differs at least between two repeats of a motion, as a share of what comes again."""
+AFRESH_EVENT = 0.5
+"""What recordings show of the difference that an event makes between two repeats, at least."""
 
 
 def is_credible(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
@@ -69,32 +72,44 @@ def has_play(problem: Problem, design: Design, noise: Noise, proposal: Proposal)
 
 
 def is_of_time(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
-    """Whether what calls itself a drift tells one repeat of a motion from the next, where there are repeats.
+    """Whether what calls itself a drift or an event tells one repeat of a motion from the next, where there are
+    repeats.
 
     What comes again with the motion, and is no steady law of the drift's kind, is some function of the motion.
     """
     effect = proposal.effect
-    if not isinstance(effect, TorqueDrift | FrictionDrift) or proposal.evidence < 0:
+    if not (effect.drifts or effect.bound_to_recording) or proposal.evidence < 0:
         return True
     shifts = [round(t.signals.period / t.motion.dt) if t.signals.period else 0 for t in problem.traces]
     if not any(shifts):
         return True
-    j, (c, _) = effect.joints[0], fitted(problem, design, noise, proposal)
-    whitened = lambda one: problem.whitened(problem.columns([one]), noise, j)[:, 0]
-    steady = [whitened(law) for law in effect.steady]
-    parts = np.column_stack([design.left[j], whitened(effect) @ c, *steady])
-    ends = np.cumsum([t.motion.samples for t in problem.traces])
-    apart, alike = [np.zeros((0, parts.shape[1]))], [np.zeros((0, parts.shape[1]))]
-    for part, trace, shift in zip(np.split(parts, ends[:-1]), problem.traces, shifts, strict=True):
+    c, _ = fitted(problem, design, noise, proposal)
+    told = apart = beyond = 0.0
+    for j in effect.joints if isinstance(effect, AbstractJointEffect) else range(problem.dof):
+        whitened = lambda one, j=j: problem.whitened([x[:, j] for x in problem.full_columns(one)], noise, j)
+        law = np.column_stack([np.zeros((len(design.left[j]), 0)), *map(whitened, effect.steady)])
+        own = whitened(effect) @ c
+        differ, alike = _between_repeats(problem, j, shifts, np.column_stack([design.left[j], own, law]))
+        left, own = differ.T[:2]
+        told += 0.25 * float(left @ left - (left - own) @ (left - own))
+        apart += 0.25 * float(own @ own)
+        own, law = alike[:, 1], alike[:, 2:]
+        beyond += float(np.sum((own - law @ np.linalg.lstsq(law, own)[0]) ** 2))
+    return told >= (AFRESH * beyond if effect.drifts else AFRESH_EVENT * apart)
+
+
+def _between_repeats(
+    problem: Problem, joint: int, shifts: Sequence[int], x: Float[np.ndarray, "rows n"]
+) -> tuple[Float[np.ndarray, "_pairs n"], Float[np.ndarray, "_pairs n"]]:
+    """Difference of one repeat and the next, and their mean, in the rows of a joint that count in both."""
+    apart, alike = [np.zeros((0, x.shape[1]))], [np.zeros((0, x.shape[1]))]
+    for rows, trace, shift in zip(problem.rows, problem.traces, shifts, strict=True):
+        part = x[rows]
         if 0 < shift < len(part):
-            counts = (trace.weights[shift:, j] > 0) & (trace.weights[:-shift, j] > 0)
+            counts = (trace.weights[shift:, joint] > 0) & (trace.weights[:-shift, joint] > 0)
             apart.append((part[shift:] - part[:-shift])[counts])
             alike.append(0.5 * (part[shift:] + part[:-shift])[counts])
-    left, drift, *_ = np.concatenate(apart).T
-    told = 0.25 * float(left @ left - (left - drift) @ (left - drift))
-    _, drift, *steady = np.concatenate(alike).T
-    law = np.column_stack(steady)
-    return told >= AFRESH * float(np.sum((drift - law @ np.linalg.lstsq(law, drift)[0]) ** 2))
+    return np.concatenate(apart), np.concatenate(alike)
 
 
 def fitted(

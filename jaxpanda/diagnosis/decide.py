@@ -119,9 +119,9 @@ def numbers(
     return sorted(out, key=lambda f: -f.evidence)
 
 
-def partly(state: State) -> bool:
+def partly(problem: Problem, state: State) -> bool:
     """Whether structure is left that the terms do not explain, or one law had to be called on again and again."""
-    before, after = leftover(state)
+    before, after = leftover(problem, state)
     main = before > LEFT_MAIN * before.max()
     if any(count > MOST_ALIKE for count in Counter(t.key for t in state.terms).values()):
         return True

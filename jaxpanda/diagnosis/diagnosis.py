@@ -232,7 +232,7 @@ def diagnose(
     written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
-        verdict=verdict(found, fitted, partly(state) or not all(_judged(problem))),
+        verdict=verdict(found, fitted, partly(problem, state) or not all(_judged(problem))),
         findings=found,
         fit=fitted,
         corrected=corrected,

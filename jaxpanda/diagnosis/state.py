@@ -118,12 +118,13 @@ def _independent(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
     return np.count_nonzero(x, 0) / (1 + 2 * np.sum(related**2, 0))
 
 
-def leftover(state: State) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
-    """Mean square of each joint's whitened residual beyond the noise's, before the terms and after them."""
-    design = state.design
+def leftover(problem: Problem, state: State) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
+    """Mean square of each joint's whitened residual beyond a saturated model's noise, before the terms and after
+    them."""
+    design, beyond = state.design, np.square(state.noise.sigma / problem.noise(state.terms).sigma)
     kept = np.arange(len(design.precision)) < len(design.precision) - sum(t.width for t in state.terms)
     bare = Design([A[:, kept] for A in design.columns], design.residual, design.precision[kept])
-    before, after = (np.array([_mean_square(e) - 1 for e in d.left]) for d in (bare, design))
+    before, after = (beyond * [_mean_square(e) for e in d.left] - 1 for d in (bare, design))
     return before, after
 
 

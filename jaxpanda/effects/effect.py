@@ -121,6 +121,11 @@ class AbstractEffect(eqx.Module):
         """Readable equation in the symbols of the parameters."""
 
     @property
+    def steady(self) -> tuple["AbstractEffect", ...]:
+        """Of an effect that drifts, the laws that it would be if it did not."""
+        return ()
+
+    @property
     def held(self) -> tuple[type["AbstractEffect"], ...]:
         """Effects whose laws this form holds besides its own: it is a sum of parts, and pays for each."""
         return ()
