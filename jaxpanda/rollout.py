@@ -159,7 +159,8 @@ def replay(
     task = make_task(
         recording, bare.opt.timestep, plant, seconds, _begin(plant, seconds) if start is None else start
     )
-    return _replay(bare, plant, task, make_gains(recording, corrected.arm), recording.name, engine)
+    gains = stable(make_gains(recording, corrected.arm), recording, plant.arm, bare.opt.timestep)
+    return _replay(bare, plant, task, gains, recording.name, engine)
 
 
 def compare(
@@ -175,6 +176,8 @@ def compare(
     arm = corrected.arm
     plants = [Plant.of(arm, arm, ()), corrected.plant(_called(corrected, recording))]
     gains, start = make_gains(recording, corrected.arm), _begin(plants[1], seconds)
+    for plant in plants:
+        gains = stable(gains, recording, plant.arm, engine_model(source, plant.arm).opt.timestep)
     out: dict[str, Any] = {"recording": recording.name}
     for when, plant in zip(("before", "after"), plants, strict=True):
         bare = engine_model(source, plant.arm)
@@ -306,6 +309,17 @@ def make_gains(recording: Recording, arm: Arm) -> Gains:
     stiffness = own + np.maximum(weakest.max(0), 0.0)
     damping = np.maximum(0.1 * stiffness, np.sqrt(stiffness * inertia.max(0)))
     return Gains(jnp.asarray(stiffness), jnp.asarray(damping))
+
+
+def stable(gains: Gains, recording: Recording, arm: Arm, dt: float) -> Gains:
+    r"""The gains with as much damping at most as an explicit step of so many seconds bears with this arm.
+
+    $h\,\lambda_{max}(M^{-1} D) \le h \sum_j D_j (M^{-1})_{jj}$ is kept below one in any pose of the motion: links
+    that a short recording has not told well may be light about some axis, and the feedback would shake them.
+    """
+    poses = recording.q[np.linspace(0, recording.samples - 1, 64).astype(int)]
+    mobility = np.diagonal(np.linalg.inv(masses(arm, poses)), axis1=1, axis2=2).max(0)
+    return Gains(gains.stiffness, jnp.minimum(gains.damping, 1 / (arm.dof * dt * jnp.asarray(mobility))))
 
 
 def _opened(

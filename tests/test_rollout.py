@@ -249,6 +249,18 @@ def test_what_sensors_add_is_undone_and_put_back(moved):
     np.testing.assert_allclose(done[1].tau, done[0].tau + torque, atol=1e-9)
 
 
+def test_feedback_damps_no_more_than_an_explicit_step_bears(moved):
+    arm, dt = two_links()[0], 0.002
+    light = eqx.tree_at(lambda a: (a.standard, a.armature), arm, (1e-4 * arm.standard, 1e-4 * arm.armature))
+    gains = rollout.make_gains(moved, arm)
+    np.testing.assert_array_equal(rollout.stable(gains, moved, arm, dt).damping, gains.damping)
+    fastest = []
+    for some in (gains, rollout.stable(gains, moved, light, dt)):
+        rates = np.linalg.solve(rollout.masses(light, moved.q[::50]), np.diag(some.damping)[None])
+        fastest.append(dt * np.abs(np.linalg.eigvals(rates)).max())
+    assert fastest[0] > 2 > 1 >= fastest[1]
+
+
 def test_bad_calls_say_what_would_work(moved, tmp_path):
     arm = two_links()[0]
     with pytest.raises(InputError, match="model="):
