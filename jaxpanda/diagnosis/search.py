@@ -5,6 +5,7 @@ of its effects. Steps add a term, drop one, put another or two in its place, or 
 of them knows an effect. What is left is a local optimum, and its neighbours, which `posterior` weighs.
 """
 
+import dataclasses
 from collections.abc import Collection, Sequence
 from typing import Any
 
@@ -115,11 +116,30 @@ def choices(
     some = [p for p in proposals if p.evidence > _WINDOW * max(proposals[0].evidence, 0.0)][:_TRIED]
     out = []
     for p in some:
-        term = taken(problem, design, noise, p)
-        more = problem.design((*terms, term), noise)
-        if is_possible(term, more):
-            out.append((more.log_evidence - own + term.prior, (term,)))
+        for form in (p, *plainer(problem, design, noise, p)):
+            term = taken(problem, design, noise, form)
+            more = problem.design((*terms, term), noise)
+            if is_possible(term, more):
+                out.append((more.log_evidence - own + term.prior, (term,)))
     return sorted(out, key=lambda choice: -choice[0])
+
+
+def plainer(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> list[Proposal]:
+    """A proposal in its plainer forms."""
+    out = []
+    for effect in proposal.effect.plainer:
+        best, deviation = evidence_of(problem, design, noise, effect)
+        gained = best - proposal.best
+        out.append(
+            dataclasses.replace(
+                proposal,
+                effect=effect,
+                best=best,
+                deviation=deviation,
+                evidence=proposal.evidence + gained,
+            )
+        )
+    return out
 
 
 def is_possible(term: Term, design: Design) -> bool:
@@ -229,9 +249,12 @@ def merge(problem: Problem, state: State, say: Any, free: bool) -> State:
                 _new(others, ranked(problem, design, state.noise, joints), free),
             )
             if found and found[0][0] > own + BETTER:
+                fewer = with_terms(problem, (*others, *found[0][1]))
+                if likelier((problem, state), (problem, fewer)) < 0:
+                    continue
                 gone = ", ".join(name(state.terms[i]) for i in group)
                 say(f"{name(found[0][1][0])} for {gone}: {found[0][0]:.1f} for {own:.1f}")
-                state = grow(problem, with_terms(problem, (*others, *found[0][1])), say, free)
+                state = grow(problem, fewer, say, free)
                 break
         else:
             return state

@@ -11,7 +11,7 @@ from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
 from ..effects.load import EVER, PayloadChange
 from .events import BIN, Proposal
-from .evidence import Design, Noise, gram, log_bayes
+from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
 from .library import form_of
 from .problem import Problem
 from .scan import scales_of
@@ -100,14 +100,19 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
         return proposal
     steps = proposal.steps[: len(shapes)]
     effect, best, deviation = climbed(problem, design, noise, proposal.effect, steps)
+    likeliest, paid = best, 0.0
     variants = sorted(effect.variants(arm), key=form_of)
-    for _, alike in itertools.groupby(variants, form_of):
-        other = best_shape(problem, design, noise, list(alike))
-        if other[0].shapes and not effect.shapes:
+    for _, group in itertools.groupby(variants, form_of):
+        alike = list(group)
+        values, deviations = score(problem, design, noise, alike)
+        top = int(values.argmax())
+        other = alike[top], float(values[top]), deviations[top]
+        search = float(log_mean_exp(values)) - other[1]  # what the choice of a shape of this form costs
+        if other[0].shapes and not shapes:
             other = climbed(problem, design, noise, other[0], first_steps(other[0]))
-        if other[1] > best:
-            effect, best, deviation = other
-    gained = best - proposal.best
+        if other[1] + search > likeliest:
+            (effect, best, deviation), likeliest, paid = other, other[1] + search, search
+    gained = best - proposal.best + paid
     return dataclasses.replace(
         proposal, effect=effect, best=best, deviation=deviation, evidence=proposal.evidence + gained
     )

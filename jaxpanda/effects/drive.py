@@ -120,6 +120,10 @@ class JointSpring(AbstractInstantEffect):
         }[self.form]
 
     @property
+    def plainer(self) -> tuple["JointSpring", ...]:
+        return (dataclasses.replace(self, form="linear"),) if self.form in ("cubic", "slack") else ()
+
+    @property
     def equation(self) -> str:
         return (
             "tau = "

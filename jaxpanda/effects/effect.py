@@ -121,6 +121,11 @@ class AbstractEffect(eqx.Module):
         """Readable equation in the symbols of the parameters."""
 
     @property
+    def plainer(self) -> tuple["AbstractEffect", ...]:
+        """Forms with fewer numbers that may do as well, where what the law may be off is allowed for."""
+        return ()
+
+    @property
     def steady(self) -> tuple["AbstractEffect", ...]:
         """Of an effect that drifts, the laws that it would be if it did not."""
         return ()
