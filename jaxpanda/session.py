@@ -129,9 +129,7 @@ def telling(what: str) -> Iterator[Say]:
     began, console = time.monotonic(), Console(stderr=True, highlight=False)
 
     def say(now: str) -> None:
-        line = Text(f"{time.monotonic() - began:6.1f} s  {now}", overflow="ellipsis", no_wrap=True)
-        line.stylize("dim")
-        console.print(line)
+        console.print(Text(f"{time.monotonic() - began:6.1f} s  {now}", style="dim"))
 
     with console.status(what):
         yield say

@@ -17,6 +17,7 @@ from helpers import excitation
 
 import jaxpanda
 from jaxpanda.__main__ import main
+from jaxpanda.diagnosis.commands import plainly
 from jaxpanda.files import write_json
 from jaxpanda.recordings import save
 from jaxpanda.recordings.recording import Recording
@@ -265,9 +266,16 @@ def test_the_corrected_file_loads_though_the_user_s_includes_others(capsys, monk
     )
     printed, told = capsys.readouterr()
     said = json.loads(printed)
-    steps = ["reading 1 recording", "log.csv: ", "looking for", *said["log"], "simulating", "writing"]
+    steps = [
+        "reading 1 recording",
+        "log.csv: ",
+        "looking for",
+        *map(plainly, said["log"]),
+        "simulating",
+        "writing",
+    ]
     lines = iter(told.splitlines())
-    for step in steps:  # in this order, each on a line that may be cut at its end
+    for step in steps:  # in this order, the rest of a long one on the next line
         assert any(step[:40] in line for line in lines), step
     assert len(said["log"]) > 1
     assert [f["effect"] for f in said["findings"]] == ["viscous_friction"]
@@ -281,6 +289,33 @@ def test_the_corrected_file_loads_though_the_user_s_includes_others(capsys, monk
     loaded = jaxpanda.Corrected.load(out)
     assert [effect.name for effect in loaded.effects] == ["viscous_friction"]
     assert pickle.loads(pickle.dumps(loaded)).to_json() == loaded.to_json()
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        (
+            "0 terms: power_law_friction[4] 1082.5; joint_spring[2] -3.1",
+            "tried every effect: power law friction at joint 4 is likeliest",
+        ),
+        (
+            "1 terms: unknown[4] 9.1; backlash[1, 2] 3.0; armature[4] 2.0; joint_spring[4] 1.0",
+            "tried every effect beside 1 found: unknown at joint 4; backlash at joints 1, 2; armature at joint 4"
+            " are likeliest",
+        ),
+        ("2 terms: coulomb_friction[7] -20.0", "tried every effect beside 2 found: none helps"),
+        ("3 terms: ", "tried every effect beside 3 found: none helps"),
+        ("add joint_spring[2] (cubic): 12.0", "added joint spring at joint 2 (cubic)"),
+        (
+            "viscous_friction[4] for power_law_friction[4]: 598.1 for 576.9",
+            "took viscous friction at joint 4 instead of power law friction at joint 4",
+        ),
+        ("suspect recordings beside them", "suspect recordings beside them"),
+        ("free forms", "looking for torque that no named effect explains"),
+    ],
+)
+def test_a_line_of_the_log_is_told_in_words(line, told):
+    assert plainly(line) == told
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,9 @@ def diagnose_files(
         suspect, healthy = load_many(recordings), load_many(reference)
         every = distinct([*suspect, *healthy])
         suspect, healthy = every[: len(suspect)], every[len(suspect) :]
-        found = diagnose(model, suspect, reference=healthy, knowledge=knowledge, progress=say)
+        found = diagnose(
+            model, suspect, reference=healthy, knowledge=knowledge, progress=lambda line: say(plainly(line))
+        )
         given = [("model", p) for p in [model] if p]
         given += [("recording", p) for p in recordings] + [("reference", p) for p in reference]
         names = {r.path: r.name for r in every}
@@ -81,11 +84,34 @@ def diagnose_files(
         else:
             say("simulating both arms along a recording")
             found = _replayed(found, suspect)
-            say("writing the page: where the difference lies, and what these recordings could have shown")
+            say("writing the report")
             sections = page.sections(found)
         report.to_html("jaxpanda: diagnosis", sections, folder / "report.html")
         found.save(out)  # not by way of the other folder: what is included may belong outside of `out`
     return found
+
+
+def plainly(line: str) -> str:
+    """A line of a diagnosis' log for who follows it on a terminal: `add coulomb_friction[4]: 139.3` in words."""
+    if tried := re.fullmatch(r"(\d+) terms: (.*)", line):
+        each = [part.rpartition(" ") for part in tried[2].split("; ")]
+        likely = [what for what, _, gained in each if what and float(gained) > 0][:3]
+        beside = f" beside {tried[1]} found" if tried[1] != "0" else ""
+        line = f"tried every effect{beside}: " + (
+            f"{'; '.join(likely)} {'is' if len(likely) == 1 else 'are'} likeliest" if likely else "none helps"
+        )
+    elif line == "free forms":
+        line = "looking for torque that no named effect explains"
+    elif taken := re.fullmatch(r"(add|drop) (.*): \S+", line):
+        line = f"{'added' if taken[1] == 'add' else 'dropped'} {taken[2]}"
+    elif changed := re.fullmatch(r"(.*) for (.*): \S+ for \S+", line):
+        line = f"took {changed[1]} instead of {changed[2]}"
+    return re.sub(r"([a-z]\w+)\[([\d, ]+)\]", _placed, line)
+
+
+def _placed(term: re.Match[str]) -> str:
+    joints = term[2].split(", ")
+    return f"{term[1].replace('_', ' ')} at joint{'s' * (len(joints) > 1)} {', '.join(joints)}"
 
 
 def _replayed(found: Diagnosis, recordings: Sequence[Recording]) -> Diagnosis:

@@ -211,11 +211,11 @@ def diagnose(
         return judge(suspect, healthy, source, knowledge)
     for recording in loaded:
         _require_live_torque(recording)
-    progress("looking for the effects that make the recordings likeliest")
+    progress("looking for effects that make the recordings likelier; that takes most of the time")
     log = _Log(progress)
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
     problem = premises.problem
-    progress(f"{len(state.terms)} effects: refining their numbers, and weighing what else they could be")
+    progress("refining the numbers, and weighing what else it could be")
     state = polished(problem, state)
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
     kept = transferable(problem, laws)
@@ -276,7 +276,7 @@ class _Log(list[str]):
 def _read(trace: Trace) -> str:
     """What was read, in a line."""
     time, dof = trace.motion.time, trace.motion.q.shape[1]
-    return f"{trace.name}: {time[-1] - time[0]:.6g} s of {dof} joints"
+    return f"{trace.name}: {time[-1] - time[0]:.1f} s, {dof} joints"
 
 
 def _still(trace: Trace) -> list[str]:
