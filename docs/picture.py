@@ -29,8 +29,11 @@ def main() -> None:
     motion = random_trajectory(model, seed=1)
     log = simulate(model, motion, friction=friction, sensors=panda_sensors(), seed=1, name="recording.csv")
     found = diagnosis.diagnose(None, [log])
+    print(*found.lines(), sep="\n")
+    for one in found.findings:
+        values = (f"{p['name']} {p['value']:.3f} ({p['std']:.3f}) {p['unit']}" for p in one.parameters)
+        print(f"{one.effect}: {', '.join(values)}")
     first = page.sections(found)[1]
-    print(first.heading, *first.sentences, sep="\n")
     (figure,) = first.figures
     with matplotlib.rc_context(
         {"font.size": 8, "lines.linewidth": 0.9, "axes.grid": True, "grid.alpha": 0.3}
