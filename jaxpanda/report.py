@@ -18,6 +18,10 @@ _PIPED_WIDTH = 200
 """Columns of text that goes to a file or a pipe; a terminal knows its own width."""
 
 
+_NARROW = 28
+"""Width from which a column of a table may be broken into lines on a terminal."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Table:
     """Rows of ready-made text under column heads; the first column names the row."""
@@ -99,18 +103,23 @@ def to_terminal(sections: Sequence[Section], width: int | None = None) -> None:
             console.print(escape(sentence), soft_wrap=not wrapped)
         for table in (part for whole in section.tables for part in _fitting(whole, console.width)):
             drawn = rich.table.Table(title=escape(table.caption) or None, title_justify="left")
-            for i, column in enumerate(table.columns):
-                drawn.add_column(escape(column), justify="left" if i == 0 else "right")
+            for i, (column, wide) in enumerate(zip(table.columns, _widths(table), strict=True)):
+                whole = i > 0 and wide < _NARROW  # what gives way to the others is broken between words
+                drawn.add_column(escape(column), justify="left" if i == 0 else "right", no_wrap=whole)
             for row in table.rows:
                 drawn.add_row(*(escape(cell) for cell in row))
             console.print(drawn)
 
 
+def _widths(table: Table) -> list[int]:
+    """Of the columns, with the lines between them."""
+    return [max(map(len, column)) + len(" │ ") for column in zip(table.columns, *table.rows, strict=True)]
+
+
 def _fitting(table: Table, width: int) -> list[Table]:
     """The table in parts that are no wider than `width`, each with the column that names the rows."""
-    cells = zip(table.columns, *table.rows, strict=True)
-    widths = [max(map(len, column)) + len(" │ ") for column in cells]
-    room = width - widths[0] - 1
+    widths = _widths(table)
+    room = width - min(widths[0], _NARROW) - 1
     groups, used = [[]], 0
     for i, wide in enumerate(widths[1:], 1):
         if groups[-1] and used + wide > room:

@@ -60,7 +60,10 @@ def _coefficients(found: Any) -> Table:
     rows = []
     for row in found.coefficients:
         std = row.get("std")
-        share = "–" if std is None or row["value"] == 0 else f"{100 * std / abs(row['value']):.2g} %"
+        share = "–"
+        if std is not None and row["value"] != 0:
+            percent = 100 * std / abs(row["value"])
+            share = f"{percent:.0f} %" if 10 <= percent < 1e6 else f"{percent:.2g} %"
         mark = "" if row["reliable"] else "unreliable"
         rows.append([row["expression"], f"{row['value']:.6g}", number(std, 2), share, mark])
     return Table(["coefficient", "value", "std", "std/value", ""], rows, "Base parameters [kg m², kg m]")

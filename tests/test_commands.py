@@ -405,6 +405,19 @@ def test_a_table_wider_than_the_terminal_goes_on_below(capsys):
     assert words.count("Inertia") == 1
 
 
+def test_long_names_of_rows_give_way_to_their_numbers(capsys):
+    from jaxpanda.report import Section, Table, to_terminal
+
+    name = " + ".join(f"0.1{i} m{i}c{i}z" for i in range(8))
+    to_terminal(
+        [Section("", [], [Table(["coefficient", "value", "std"], [[name, "0.0519807", "0.0018"]])])], 80
+    )
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 80
+    assert out.count("coefficient") == out.count("0.0519807") == out.count("0.0018") == 1
+    assert re.findall(r"m\dc\dz", out) == re.findall(r"m\dc\dz", name)
+
+
 def test_an_export_s_table_has_six_digits_and_its_json_all():
     from jaxpanda.export import Change
     from jaxpanda.pipeline import Export
