@@ -10,7 +10,9 @@ import difflib
 import io
 import os
 import re
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -244,6 +246,9 @@ def _parse(arguments: list[str]) -> Any:
     for command in _COMMANDS:
         spelled = Annotated[command, tyro.conf.subcommand(command.__name__.lower())]
         union = spelled if union is None else union | spelled
+    given = _options(arguments)
+    if twice := [option for option in given if given.count(option) > 1]:  # the last would silently win
+        raise InputError(f"{twice[0]} is given twice; values that belong to one option stand after one flag")
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
@@ -265,10 +270,11 @@ def _sentence(arguments: list[str], panel: str) -> str:
     commands = {command.__name__.lower(): command for command in _COMMANDS}
     name = arguments[0] if arguments else ""
     if name not in commands:
-        what = f"no command {name!r}{_meant(name, commands)}" if name else "no command given"
+        known = [*commands, "--help", "--version"]
+        what = f"no command {name!r}{_meant(name, known)}" if name else "no command given"
         return f"{what}; there are {', '.join(commands)}: see jaxpanda --help"
     fields = {"--" + field.name.replace("_", "-"): field for field in dataclasses.fields(commands[name])}
-    given = [word.split("=")[0].replace("_", "-") for word in arguments[1:] if re.match("--[a-z]", word)]
+    given = _options(arguments)
     words = " ".join(line.strip("╭╮╰╯│─+|- ") for line in panel.splitlines())  # a frame, of lines or of ASCII
     text = " ".join(re.sub(r"[-─]{3,}", " ", words).split())
     unknown = [option for option in given if option not in fields]
@@ -282,8 +288,12 @@ def _sentence(arguments: list[str], panel: str) -> str:
     elif choice := re.search(r"invalid choice '(.*?)' for argument '(.*?)'.*?\((.*?)\)", text):
         what = f"{choice[2]} {choice[1]}: is none of {choice[3].replace(chr(39), '')}"
     elif wrong := re.search(r"Error parsing (--[\w-]+): (.*?) Argument helptext", text):
-        number = re.fullmatch(r"invalid literal for int\(\) with base 10: (.*)", wrong[2])
-        what = f"{wrong[1]}: {number[1]} is no whole number" if number else f"{wrong[1]}: {wrong[2]}"
+        what = f"{wrong[1]}: {_no_number(wrong[2])}"
+    elif empty := re.search(r"Missing value for argument '(--[\w-]+)", text):
+        what = f"{empty[1]} has no value after it"
+    elif stray := re.search(r"Unrecognized options: ([^\s,]+)", text):
+        what = f"{name}: no option takes {stray[1]!r}"
+        what += f", and {' and '.join(missing)} must be given" if missing else ""
     elif missing:
         what = f"{name} needs {' and '.join(missing)}"
     else:
@@ -291,9 +301,34 @@ def _sentence(arguments: list[str], panel: str) -> str:
     return f"{what}; see jaxpanda {name} --help"
 
 
+def _options(arguments: list[str]) -> list[str]:
+    """The options given, as they are called in the help."""
+    return [word.split("=")[0].replace("_", "-") for word in arguments[1:] if re.match("--?[A-Za-z]", word)]
+
+
+def _no_number(complaint: str) -> str:
+    """Python's complaint about a number, in words."""
+    for said, kind in (
+        (r"invalid literal for int\(\) with base 10: (.*)", "whole number"),
+        (r"could not convert string to float: (.*)", "number"),
+    ):
+        if found := re.fullmatch(said, complaint):
+            return f"{found[1]} is no {kind}"
+    return complaint
+
+
 def _meant(word: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(word, list(known), 1)
     return f" (did you mean {close[0]}?)" if close else ""
+
+
+def _complain(sentence: str) -> None:
+    """One line on standard error; on a terminal, broken between words."""
+    line = f"jaxpanda: {sentence}"
+    if sys.stderr.isatty():
+        width = shutil.get_terminal_size().columns
+        line = textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
+    print(line, file=sys.stderr)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -306,6 +341,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     try:
         command = _parse(arguments)
+        if sys.stderr.isatty():  # JAX takes seconds to import
+            print(f"jaxpanda {arguments[0]}: starting", file=sys.stderr, flush=True)
         from . import session
 
         session.start()
@@ -321,10 +358,10 @@ def main(arguments: list[str] | None = None) -> int:
 
             report.to_terminal(summaries.of(result))
     except InputError as error:
-        print(f"jaxpanda: {error}", file=sys.stderr)
+        _complain(str(error))
         return 2
     except KeyboardInterrupt as stop:
-        print(f"jaxpanda: interrupted; {str(stop) or 'nothing was left half-written'}", file=sys.stderr)
+        _complain(f"interrupted; {str(stop) or 'nothing was left half-written'}")
         return 1
     return 0
 

@@ -21,7 +21,7 @@ from .lint import lint
 from .mjcf import from_document, from_mjcf
 from .recordings import Recording, distinct, load_many
 from .retrieval import CHECKPOINT_FILE, Retrieval, retrieve
-from .session import progress
+from .session import progress, telling
 from .urdf import left_out, to_urdf
 from .validation import Validation, validate
 
@@ -212,7 +212,9 @@ def validate_files(
     out: Path, model: Path, recordings: Sequence[Path], *, cutoff: float, in_mjx: bool = True
 ) -> Validation:
     """`jaxpanda validate`: with the offset in an exported file's sidecar, and what the lint has to say."""
-    with output_folder(out) as folder:
+    engines = "MuJoCo and MJX; MJX takes most of the time, --no-mjx leaves it out" if in_mjx else "MuJoCo"
+    with output_folder(out) as folder, telling("validating") as say:
+        say(f"comparing inverse dynamics, torque and a roll-out in {engines}")
         friction, beside = beyond_mjcf(model)
         checked = validate(model, recordings_of(recordings), cutoff=cutoff, in_mjx=in_mjx, friction=friction)
         slips = tuple(f"{slip.severity}: {slip.where}: {slip.message}" for slip in lint(model))

@@ -6,6 +6,7 @@ two ways to read it. The page needs no network: figures are SVG inside it.
 
 import dataclasses
 import io
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,6 +16,10 @@ from .files import write_text
 
 _PIPED_WIDTH = 200
 """Columns of text that goes to a file or a pipe; a terminal knows its own width."""
+
+
+_NARROW = 28
+"""Width from which a column of a table may be broken into lines on a terminal."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,26 +88,53 @@ def to_terminal(sections: Sequence[Section], width: int | None = None) -> None:
 
     Args:
         sections: what to print.
-        width: of the lines, between whose words sentences are broken; without it that of the terminal, and on a
-            file or pipe a sentence is a line.
+        width: of the lines, between whose words sentences are broken; without it that of the terminal or in
+            `COLUMNS`, and on a file or pipe a sentence is a line. A table that is wider is continued below.
     """
     import rich.table
     from rich.console import Console
     from rich.markup import escape
 
-    wrapped = width is not None or sys.stdout.isatty()
+    wrapped = width is not None or sys.stdout.isatty() or "COLUMNS" in os.environ
     console = Console(highlight=False, width=width if wrapped else _PIPED_WIDTH)
     for section in sections:
         console.print(f"\n[bold]{escape(section.heading)}[/bold]")
         for sentence in section.sentences:
             console.print(escape(sentence), soft_wrap=not wrapped)
-        for table in section.tables:
+        for table in (part for whole in section.tables for part in _fitting(whole, console.width)):
             drawn = rich.table.Table(title=escape(table.caption) or None, title_justify="left")
-            for i, column in enumerate(table.columns):
-                drawn.add_column(escape(column), justify="left" if i == 0 else "right")
+            for i, (column, wide) in enumerate(zip(table.columns, _widths(table), strict=True)):
+                whole = i > 0 and wide < _NARROW  # what gives way to the others is broken between words
+                drawn.add_column(escape(column), justify="left" if i == 0 else "right", no_wrap=whole)
             for row in table.rows:
                 drawn.add_row(*(escape(cell) for cell in row))
             console.print(drawn)
+
+
+def _widths(table: Table) -> list[int]:
+    """Of the columns, with the lines between them."""
+    return [max(map(len, column)) + len(" │ ") for column in zip(table.columns, *table.rows, strict=True)]
+
+
+def _fitting(table: Table, width: int) -> list[Table]:
+    """The table in parts that are no wider than `width`, each with the column that names the rows."""
+    widths = _widths(table)
+    room = width - min(widths[0], _NARROW) - 1
+    groups, used = [[]], 0
+    for i, wide in enumerate(widths[1:], 1):
+        if groups[-1] and used + wide > room:
+            groups.append([])
+            used = 0
+        groups[-1].append(i)
+        used += wide
+    return [
+        Table(
+            [table.columns[i] for i in (0, *group)],
+            [[row[i] for i in (0, *group)] for row in table.rows],
+            table.caption if group is groups[0] else "",
+        )
+        for group in groups
+    ]
 
 
 def to_html(title: str, sections: Sequence[Section], path: str | Path) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 from .errors import InputError
 
@@ -105,3 +107,29 @@ def progress(what: str) -> Iterator[Tick]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+Say = Callable[[str], None]
+"""Called with what a stage is doing now."""
+
+
+def silent(_: str) -> None:
+    """For who does not want to be told."""
+
+
+@contextlib.contextmanager
+def telling(what: str) -> Iterator[Say]:
+    """What a stage does, on a terminal: each thing a line with the seconds since the start; else silent.
+
+    For stages that do not know how much is left; `progress` is for those that count.
+    """
+    if not sys.stderr.isatty():
+        yield silent
+        return
+    began, console = time.monotonic(), Console(stderr=True, highlight=False)
+
+    def say(now: str) -> None:
+        console.print(Text(f"{time.monotonic() - began:6.1f} s  {now}", style="dim"))
+
+    with console.status(what):
+        yield say

@@ -60,7 +60,10 @@ def _coefficients(found: Any) -> Table:
     rows = []
     for row in found.coefficients:
         std = row.get("std")
-        share = "–" if std is None or row["value"] == 0 else f"{100 * std / abs(row['value']):.2g} %"
+        share = "–"
+        if std is not None and row["value"] != 0:
+            percent = 100 * std / abs(row["value"])
+            share = f"{percent:.0f} %" if 10 <= percent < 1e6 else f"{percent:.2g} %"
         mark = "" if row["reliable"] else "unreliable"
         rows.append([row["expression"], f"{row['value']:.6g}", number(std, 2), share, mark])
     return Table(["coefficient", "value", "std", "std/value", ""], rows, "Base parameters [kg m², kg m]")
@@ -244,6 +247,22 @@ def _finding(place: int, one: Mapping[str, Any], names: Sequence[str], force: st
     return Section(f"{place + 1}. {one['effect'].replace('_', ' ')}", sentences, tables)
 
 
+def prediction(made: Any) -> Sequence[Section]:
+    """Where the torque was written and, where torque was recorded, how far the two are apart."""
+    sentences = [f"{made.rows} rows of torque in {made.path}."]
+    columns: dict[str, Any] = {"rms": made.rms}
+    if made.rmse is not None:
+        share = made.relative_error_percent
+        sentences.append(
+            "The recorded torque is zero throughout, so that there is no relative error."
+            if share is None
+            else f"Error against the recorded torque, its noise included: {number(share)} %."
+        )
+        columns["error, rms"] = made.rmse
+    caption = f"Predicted torque [{made.unit}]"
+    return [Section("Prediction", sentences, [by_joint(caption, made.joints, columns)])]
+
+
 def by_joint(caption: str, names: Sequence[str], columns: Mapping[str, Any]) -> Table:
     """A row a joint; columns without values are left out."""
     present = {head: values for head, values in columns.items() if values is not None and len(values)}
@@ -321,6 +340,6 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Validation": validation,
     "Diagnosis": diagnosis,
     "AtRest": diagnosis,
-    "Prediction": lambda result: [Section("Prediction", result.lines())],
+    "Prediction": prediction,
     "Demonstration": lambda result: result.sections,
 }

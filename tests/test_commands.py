@@ -1,5 +1,6 @@
 """The commands: what they leave, what they print, and how they refuse."""
 
+import dataclasses
 import json
 import pickle
 import re
@@ -16,6 +17,8 @@ from helpers import excitation
 
 import jaxpanda
 from jaxpanda.__main__ import main
+from jaxpanda.diagnosis.commands import plainly
+from jaxpanda.files import write_json
 from jaxpanda.recordings import save
 from jaxpanda.recordings.recording import Recording
 
@@ -64,6 +67,24 @@ def test_help_needs_no_jax():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "identify" in done.stdout
+
+
+def test_the_terminal_is_told_of_a_command_before_jax_is_imported():
+    """A diagnosis was silent for its first seconds, and for as long as it took."""
+    code = (
+        "import io, sys\n"
+        "class Terminal(io.StringIO):\n"
+        "    def isatty(self): return True\n"
+        "    def write(self, text):\n"
+        "        if not self.getvalue(): seen.append((text, 'jax' in sys.modules))\n"
+        "        return super().write(text)\n"
+        "seen, sys.stderr = [], Terminal()\n"
+        "from jaxpanda.__main__ import main\n"
+        "assert main(['diagnose', '--recording', 'missing.csv', '--out', 'never']) == 2\n"
+        "print(seen)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "[('jaxpanda diagnose: starting', False)]\n", done.stderr
 
 
 def test_every_public_name_resolves():
@@ -196,7 +217,37 @@ def test_a_recording_of_another_arm_is_refused(capsys, tmp_path):
     assert "6 joints" in line
 
 
-def test_the_corrected_file_loads_though_the_user_s_includes_others(capsys, tmp_path):
+def test_a_prediction_says_how_far_it_is_from_torque_that_was_recorded(capsys, tmp_path):
+    """A user had to work out the error of a prediction from two files."""
+    arm = jaxpanda.Arm.from_mjcf(MODELS / "odd_axes.xml")
+    zero = jax.numpy.zeros(arm.dof)
+    nothing = jaxpanda.Corrected(arm, jax.numpy.zeros((arm.dof, 10)), zero, zero, (), ())
+    write_json(tmp_path / "corrected.json", {**nothing.to_json(), "torque_noise": [0.05] * arm.dof})
+    recorded = shaken(arm, lambda qd: 0.3 * qd)
+    said = {}
+    for name, tau in (("motion", None), ("recorded", recorded.tau), ("dead", 0 * recorded.q)):
+        save(dataclasses.replace(recorded, tau=tau), tmp_path / f"{name}.csv")
+        files = ["--recording", str(tmp_path / f"{name}.csv"), "--out", str(tmp_path / f"{name}_tau.csv")]
+        command = ["predict", "--diagnosis", str(tmp_path), *files]
+        assert main([*command, "--json"]) == 0
+        said[name] = json.loads(capsys.readouterr().out)
+    assert said["motion"]["rmse"] is said["motion"]["relative_error_percent"] is None
+    assert (tmp_path / "motion_tau.csv").read_bytes() == (tmp_path / "recorded_tau.csv").read_bytes()
+    error = np.loadtxt(tmp_path / "recorded_tau.csv", delimiter=",", skiprows=1)[:, 1:] - recorded.tau
+    np.testing.assert_allclose(said["recorded"]["rmse"], np.sqrt(np.mean(error**2, 0)), rtol=1e-9)
+    share = 100 * np.sqrt(np.sum(error**2) / np.sum(recorded.tau**2))
+    assert said["recorded"]["relative_error_percent"] == pytest.approx(share, rel=1e-9)
+    assert said["dead"]["relative_error_percent"] is None
+
+    command[4] = str(tmp_path / "recorded.csv")
+    assert main(command) == 0
+    out = capsys.readouterr().out
+    assert f"its noise included: {share:.4g} %." in out
+    assert all(f"{rmse:.4g}" in out for rmse in said["recorded"]["rmse"])
+    assert not re.search(r"\d\.\d{7}", out)
+
+
+def test_the_corrected_file_loads_though_the_user_s_includes_others(capsys, monkeypatch, tmp_path):
     """A finding in such a model ended in "panda.xml: includes 'parts/defaults.xml', which cannot be read"."""
     shutil.copytree(MODELS, tmp_path / "in")
     model, out = tmp_path / "in" / "including.xml", tmp_path / "out"
@@ -209,10 +260,24 @@ def test_the_corrected_file_loads_though_the_user_s_includes_others(capsys, tmp_
     defaults.write_text(re.sub(r' frictionloss="[\d.]+"', "", defaults.read_text()))
     arm, log = jaxpanda.Arm.from_mjcf(model), tmp_path / "log.csv"
     save(shaken(arm, lambda qd: 3 * qd * [0, 1, 0]), log)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     assert (
         main(["diagnose", "--model", str(model), "--recording", str(log), "--out", str(out), "--json"]) == 0
     )
-    said = json.loads(capsys.readouterr()[0])
+    printed, told = capsys.readouterr()
+    said = json.loads(printed)
+    steps = [
+        "reading 1 recording",
+        "log.csv: ",
+        "looking for",
+        *map(plainly, said["log"]),
+        "simulating",
+        "writing",
+    ]
+    lines = iter(told.splitlines())
+    for step in steps:  # in this order, the rest of a long one on the next line
+        assert any(step[:40] in line for line in lines), step
+    assert len(said["log"]) > 1
     assert [f["effect"] for f in said["findings"]] == ["viscous_friction"]
     assert said["replays"]
     assert any("1 meshes, textures or attached models (hall.obj, ...)" in note for note in said["notes"])
@@ -227,12 +292,47 @@ def test_the_corrected_file_loads_though_the_user_s_includes_others(capsys, tmp_
 
 
 @pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        (
+            "0 terms: power_law_friction[4] 1082.5; joint_spring[2] -3.1",
+            "tried every effect: power law friction at joint 4 is likeliest",
+        ),
+        (
+            "1 terms: unknown[4] 9.1; backlash[1, 2] 3.0; armature[4] 2.0; joint_spring[4] 1.0",
+            "tried every effect beside 1 found: unknown at joint 4; backlash at joints 1, 2; armature at joint 4"
+            " are likeliest",
+        ),
+        ("2 terms: coulomb_friction[7] -20.0", "tried every effect beside 2 found: none helps"),
+        ("3 terms: ", "tried every effect beside 3 found: none helps"),
+        ("add joint_spring[2] (cubic): 12.0", "added joint spring at joint 2 (cubic)"),
+        (
+            "viscous_friction[4] for power_law_friction[4]: 598.1 for 576.9",
+            "took viscous friction at joint 4 instead of power law friction at joint 4",
+        ),
+        ("suspect recordings beside them", "suspect recordings beside them"),
+        ("free forms", "looking for torque that no named effect explains"),
+    ],
+)
+def test_a_line_of_the_log_is_told_in_words(line, told):
+    assert plainly(line) == told
+
+
+@pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["inspekt"], "no command 'inspekt' (did you mean inspect?)"),
         (["inspect", "--recordin", "a.csv"], "inspect has no option --recordin (did you mean --recording?)"),
         (["retrieve", "--out", "x"], "retrieve needs --identification"),
         (["demo", "--out", "d", "--starts", "many"], "--starts: 'many' is no whole number"),
+        (["identify", "--out", "d", "--cutoff", "five"], "--cutoff: 'five' is no number"),
+        (["--verion"], "no command '--verion' (did you mean --version?)"),
+        (["demo", "--out"], "--out has no value after it"),
+        (["demo", "--out", "a", "b"], "demo: no option takes 'b'"),
+        (["inspect", "a.csv"], "inspect: no option takes 'a.csv', and --recording must be given"),
+        (["inspect", "-recording", "a.csv"], "inspect has no option -recording (did you mean --recording?)"),
+        (["predict", "--diagnosis", "a", "--recording", "b", "c", "--out", "d"], "no option takes 'c'"),
+        (["demo", "--out", "d", "--json=true"], "demo: no option takes 'true'"),
         (
             ["retrieve", "--identification", "a", "--out", "b", "--weighting", "heavy"],
             "--weighting heavy: is none of auto, torque, none",
@@ -258,6 +358,25 @@ def test_both_packages_tell_type_checkers_that_they_are_typed():
         assert (Path(package.__file__).parent / "py.typed").is_file()
 
 
+def test_an_option_given_twice_is_refused(capsys):
+    """The last one won, and the recordings of the first were left out in silence."""
+    line = refused(capsys, "inspect", "--recording", "a.csv", "--recording", "b.csv")
+    assert "--recording is given twice" in line
+
+
+@pytest.mark.parametrize("width", [80, 100])
+def test_an_error_is_broken_between_words_on_a_terminal(capsys, monkeypatch, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert main(["export", "--retrieval", "a", "--out", "b", "--modle", "c"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) > 1 or width == 100
+    assert max(map(len, lines)) <= width
+    assert " ".join(lines) == (
+        "jaxpanda: export has no option --modle (did you mean --model?); see jaxpanda export --help"
+    )
+
+
 @pytest.mark.parametrize("width", [80, 100])
 def test_prose_is_broken_between_words(capsys, width):
     from jaxpanda.report import Section, to_terminal
@@ -267,6 +386,36 @@ def test_prose_is_broken_between_words(capsys, width):
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= width
     assert " ".join(line.strip() for line in lines[2:]).split() == words.split()
+
+
+def test_a_table_wider_than_the_terminal_goes_on_below(capsys):
+    """Its numbers were folded or cut off."""
+    from jaxpanda.report import Section, Table, to_terminal
+
+    heads = ["link", *(f"column {j}" for j in range(11))]
+    rows = [[f"link{i}", *(f"{i}.{j:05d}" for j in range(11))] for i in range(3)]
+    to_terminal([Section("Links", [], [Table(heads, rows, "Inertia")])], width=80)
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 80
+    words = re.findall(r"[\w.]+", out)
+    assert [word for word in words if re.fullmatch(r"\d\.\d{5}", word)] == [
+        cell for part in (slice(1, 7), slice(7, 12)) for row in rows for cell in row[part]
+    ]
+    assert words.count("link2") == out.count("link ") == 2
+    assert words.count("Inertia") == 1
+
+
+def test_long_names_of_rows_give_way_to_their_numbers(capsys):
+    from jaxpanda.report import Section, Table, to_terminal
+
+    name = " + ".join(f"0.1{i} m{i}c{i}z" for i in range(8))
+    to_terminal(
+        [Section("", [], [Table(["coefficient", "value", "std"], [[name, "0.0519807", "0.0018"]])])], 80
+    )
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 80
+    assert out.count("coefficient") == out.count("0.0519807") == out.count("0.0018") == 1
+    assert re.findall(r"m\dc\dz", out) == re.findall(r"m\dc\dz", name)
 
 
 def test_an_export_s_table_has_six_digits_and_its_json_all():

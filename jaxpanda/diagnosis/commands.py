@@ -2,19 +2,22 @@
 
 import dataclasses
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from .. import report
-from ..corrected import XML
+from ..corrected import XML, read
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_folder, write_text
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
+from ..session import telling
 from . import page, resting
 from .diagnosis import Diagnosis, diagnose, predict
 from .host import on_host
@@ -27,19 +30,26 @@ class Prediction:
 
     path: Path
     rows: int
+    joints: tuple[str, ...]
+    unit: str
+    """Of torque; of force too where joints slide."""
     rms: tuple[float, ...]
-    """Of each joint's torque [N m]."""
+    """Of each joint's torque."""
+    rmse: tuple[float, ...] | None = None
+    """Of each joint against the torque that the motion's file has, noise included; None where it has none."""
+    relative_error_percent: float | None = None
+    """Norm of that error over the norm of the recorded torque."""
 
     def to_json(self) -> dict[str, Any]:
         return {
             "schema": "jaxpanda.prediction/1",
             "path": str(self.path),
             "rows": self.rows,
+            "joints": list(self.joints),
             "rms": list(self.rms),
+            "rmse": None if self.rmse is None else list(self.rmse),
+            "relative_error_percent": self.relative_error_percent,
         }
-
-    def lines(self) -> list[str]:
-        return [f"{self.rows} rows of torque in {self.path}."]
 
 
 @on_host
@@ -53,11 +63,15 @@ def diagnose_files(
     """`jaxpanda diagnose`."""
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
-    with output_folder(out) as folder:
+    with output_folder(out) as folder, telling("diagnosing") as say:
+        count = len(recordings) + len(reference)
+        say(f"reading {count} recording{'s' * (count != 1)}")
         suspect, healthy = load_many(recordings), load_many(reference)
         every = distinct([*suspect, *healthy])
         suspect, healthy = every[: len(suspect)], every[len(suspect) :]
-        found = diagnose(model, suspect, reference=healthy, knowledge=knowledge)
+        found = diagnose(
+            model, suspect, reference=healthy, knowledge=knowledge, progress=lambda line: say(plainly(line))
+        )
         given = [("model", p) for p in [model] if p]
         given += [("recording", p) for p in recordings] + [("reference", p) for p in reference]
         names = {r.path: r.name for r in every}
@@ -68,11 +82,36 @@ def diagnose_files(
         if isinstance(found, resting.AtRest):
             sections = resting.sections(found)
         else:
+            say("simulating both arms along a recording")
             found = _replayed(found, suspect)
+            say("writing the report")
             sections = page.sections(found)
         report.to_html("jaxpanda: diagnosis", sections, folder / "report.html")
         found.save(out)  # not by way of the other folder: what is included may belong outside of `out`
     return found
+
+
+def plainly(line: str) -> str:
+    """A line of a diagnosis' log for who follows it on a terminal: `add coulomb_friction[4]: 139.3` in words."""
+    if tried := re.fullmatch(r"(\d+) terms: (.*)", line):
+        each = [part.rpartition(" ") for part in tried[2].split("; ")]
+        likely = [what for what, _, gained in each if what and float(gained) > 0][:3]
+        beside = f" beside {tried[1]} found" if tried[1] != "0" else ""
+        line = f"tried every effect{beside}: " + (
+            f"{'; '.join(likely)} {'is' if len(likely) == 1 else 'are'} likeliest" if likely else "none helps"
+        )
+    elif line == "free forms":
+        line = "looking for torque that no named effect explains"
+    elif taken := re.fullmatch(r"(add|drop) (.*): \S+", line):
+        line = f"{'added' if taken[1] == 'add' else 'dropped'} {taken[2]}"
+    elif changed := re.fullmatch(r"(.*) for (.*): \S+ for \S+", line):
+        line = f"took {changed[1]} instead of {changed[2]}"
+    return re.sub(r"([a-z]\w+)\[([\d, ]+)\]", _placed, line)
+
+
+def _placed(term: re.Match[str]) -> str:
+    joints = term[2].split(", ")
+    return f"{term[1].replace('_', ' ')} at joint{'s' * (len(joints) > 1)} {', '.join(joints)}"
 
 
 def _replayed(found: Diagnosis, recordings: Sequence[Recording]) -> Diagnosis:
@@ -98,10 +137,20 @@ def _source(role: str, path: Path, names: Mapping[Path | None, str]) -> dict[str
 
 
 def predict_files(diagnosis: Path, recording: Path, out: Path) -> Prediction:
-    """`jaxpanda predict`."""
+    """`jaxpanda predict`: torque, and where the motion has torque recorded, how far it is off."""
     motion = load(recording)
+    arm = read(diagnosis)[0].arm
     tau = predict(diagnosis, motion)
     head = ",".join(["time", *(f"tau_{j + 1}" for j in range(tau.shape[1]))])
     table = np.column_stack([motion.time if motion.stamps is None else motion.stamps, tau]).tolist()
     write_text(out, "\n".join([head, *(",".join(map(repr, row)) for row in table)]) + "\n")
-    return Prediction(out, len(tau), tuple(float(v) for v in np.sqrt(np.mean(tau**2, 0))))
+    made = Prediction(out, len(tau), arm.joint_names, arm.unit("N·m"), _rms(tau))
+    if motion.tau is None:
+        return made
+    error, size = tau - motion.tau, float(np.linalg.norm(motion.tau))
+    share = 100 * float(np.linalg.norm(error)) / size if size else None
+    return dataclasses.replace(made, rmse=_rms(error), relative_error_percent=share)
+
+
+def _rms(torque: Float[np.ndarray, "rows dof"]) -> tuple[float, ...]:
+    return tuple(np.sqrt(np.mean(torque**2, 0)).tolist())

@@ -29,6 +29,7 @@ from ..export import (
 from ..feasible.nearest import are_buildable, nearest_buildable
 from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, distinct, load
+from ..session import Say, silent
 from . import knowledge as knowledge_
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
@@ -175,6 +176,7 @@ def diagnose(
     *,
     reference: Sequence[str | Path | Recording] = (),
     knowledge: knowledge_.Knowledge = "identified",
+    progress: Say = silent,
 ) -> Diagnosis | AtRest:
     """Say which physics a simulation is missing; of an arm that holds still, what friction at rest leaves open.
 
@@ -183,6 +185,7 @@ def diagnose(
         recordings: of the arm, with torque.
         reference: recordings of the same arm from when nothing was wrong; what they show is not reported.
         knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` explains the words.
+        progress: called with what is being done, and with each line of `log` as it is written.
 
     Raises:
         InputError: a file that cannot be read, a recording that does not fit the model, or one given twice.
@@ -201,15 +204,18 @@ def diagnose(
         recording.require_dof(arm.dof)
         recording.require_tau()
         traces.append(prepare(recording, arm))
+        progress(_read(traces[-1]))
     suspect = [trace for trace, on in zip(traces, active, strict=True) if on]
     if all(rests(trace) for trace in suspect):
         healthy = [trace for trace, on in zip(traces, active, strict=True) if not on]
         return judge(suspect, healthy, source, knowledge)
     for recording in loaded:
         _require_live_torque(recording)
-    log: list[str] = []
+    progress("looking for effects that make the recordings likelier; that takes most of the time")
+    log = _Log(progress)
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
     problem = premises.problem
+    progress("refining the numbers, and weighing what else it could be")
     state = polished(problem, state)
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
     kept = transferable(problem, laws)
@@ -253,6 +259,24 @@ def diagnose(
         knowledge=premises.knowledge,
         spread=premises.spread,
     )
+
+
+class _Log(list[str]):
+    """Lines that are also told as they are written."""
+
+    def __init__(self, progress: Say) -> None:
+        super().__init__()
+        self.progress = progress
+
+    def append(self, line: str) -> None:
+        super().append(line)
+        self.progress(line)
+
+
+def _read(trace: Trace) -> str:
+    """What was read, in a line."""
+    time, dof = trace.motion.time, trace.motion.q.shape[1]
+    return f"{trace.name}: {time[-1] - time[0]:.1f} s, {dof} joints"
 
 
 def _still(trace: Trace) -> list[str]:
