@@ -1,6 +1,8 @@
-"""Pairs of recordings without and with a body at the flange, by MuJoCo's C engine and plain formulas of friction."""
+"""Pairs of recordings without and with a body at the flange: MuJoCo's C engine, friction by plain formulas."""
 
 import dataclasses
+import importlib.util
+import itertools
 import sys
 from pathlib import Path
 
@@ -10,10 +12,15 @@ from helpers import half_correlated
 
 from jaxpanda.recordings import Recording
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "experiments" / "concealed"))
-import arm as panda  # noqa: E402
+_SPEC = importlib.util.spec_from_file_location(
+    "concealed_arm", Path(__file__).parents[1] / "experiments" / "concealed" / "arm.py"
+)
+assert _SPEC is not None
+assert _SPEC.loader is not None
+panda = importlib.util.module_from_spec(_SPEC)  # not as `arm`, which other folders have too
+sys.modules["concealed_arm"] = panda
+_SPEC.loader.exec_module(panda)
 
-sys.path.pop(0)
 RATE = 200.0
 
 
@@ -45,7 +52,13 @@ def fourier(seed: int, seconds: float, dof: int, middle: np.ndarray, reach: floa
 
 
 def record(
-    name: str, xml: str, motion, friction: Friction | None, seed: int, noise: float = 0.03, gripped: float = 0.9
+    name: str,
+    xml: str,
+    motion,
+    friction: Friction | None,
+    seed: int,
+    noise: float = 0.03,
+    gripped: float = 0.9,
 ) -> Recording:
     """What an arm shows in a motion; half of the noise is correlated."""
     t, q, qd, qdd = motion
@@ -63,15 +76,47 @@ def record(
     return Recording(name, t, q + 1e-5 * rng.normal(size=q.shape), qd=qd, tau=tau)
 
 
-BODY = panda.Body(1.37, np.array([0.031, -0.012, 0.083]), np.array([0.0052, 0.0061, 0.0034, 3e-4, -4e-4, 2e-4]))
+BODY = panda.Body(
+    1.37, np.array([0.031, -0.012, 0.083]), np.array([0.0052, 0.0061, 0.0034, 3e-4, -4e-4, 2e-4])
+)
 
 
-def panda_pair(seed: int, body: panda.Body | None = BODY, *, seconds=20.0, speed=1.0, changed=0.03, friction=True):
-    """The user's MJCF (links off by some per cent, no friction), and recordings without and with the body."""
+def inertial(body: panda.Body) -> str:
+    """As MJCF has it."""
+    values = (" ".join(repr(float(v)) for v in np.atleast_1d(x)) for x in (body.mass, body.com, body.inertia))
+    return '<inertial mass="{}" pos="{}" fullinertia="{}"/>'.format(*values)
+
+
+def held_poses(seed: int, count: int, hold: float = 2.0, go: float = 1.5):
+    """From pose to pose by minimum jerk, each held for a while."""
+    rng, rows = np.random.default_rng(seed), int((hold + go) * RATE)
+    poses = panda.HOME + rng.uniform(-0.6, 0.6, (count + 1, 7))
+    s = np.clip(np.arange(rows) / (go * RATE), 0, 1)[:, None]
+    share = s**3 * (10 - 15 * s + 6 * s * s)
+    q = np.concatenate([a + share * (b - a) for a, b in itertools.pairwise(poses)])
+    qd = np.gradient(q, 1 / RATE, axis=0)
+    return np.arange(len(q)) / RATE, q, qd, np.gradient(qd, 1 / RATE, axis=0)
+
+
+def panda_truth(seed: int) -> tuple[str, panda.Arm]:
+    """A user's MJCF, its links off by some per cent, and the arm as it is."""
     rng = np.random.default_rng(seed)
     truth = panda.draw_arm(rng)
     truth = dataclasses.replace(truth, damping=np.zeros(7), frictionloss=np.zeros(7), gripper=None)
-    user = panda.mjcf(panda.rough(truth, rng))
+    return panda.mjcf(panda.rough(truth, rng)), truth
+
+
+def panda_pair(
+    seed: int,
+    body: panda.Body | None = BODY,
+    *,
+    seconds: float = 20.0,
+    speed: float = 1.0,
+    changed: float = 0.03,
+) -> tuple[str, Recording, Recording]:
+    """A user's MJCF without friction, and recordings without and with the body, friction a little changed."""
+    user, truth = panda_truth(seed)
+    rng = np.random.default_rng(1000 + seed)
     big = np.array([1, 1, 1, 1, 0.4, 0.4, 0.4])
     law = Friction(rng.uniform(0.2, 0.8, 7) * big, rng.uniform(0.2, 1.0, 7) * big, 0.3, 0.02)
     warmer = dataclasses.replace(
@@ -83,6 +128,6 @@ def panda_pair(seed: int, body: panda.Body | None = BODY, *, seconds=20.0, speed
     loaded = dataclasses.replace(truth, load=body)
     return (
         user,
-        record("without", panda.mjcf(truth), motions[0], law if friction else None, 10 * seed + 3),
-        record("with", panda.mjcf(loaded), motions[1], warmer if friction else None, 10 * seed + 4),
+        record("without", panda.mjcf(truth), motions[0], law, 10 * seed + 3),
+        record("with", panda.mjcf(loaded), motions[1], warmer, 10 * seed + 4),
     )

@@ -30,7 +30,7 @@ _RATE = 2.5 * CUTOFF
 """Rate at which filtered rows are used, at least [Hz]: closer rows repeat each other."""
 _FINE = 200.0
 """Rate on which columns are made, at least [Hz]."""
-_SLOW = 0.02
+SLOW = 0.02
 """Speed within which dry friction turns [rad/s or m/s]: below it positions hardly tell the sign."""
 _STILL = 0.005
 """Speed below which a joint rests [rad/s or m/s]."""
@@ -44,8 +44,10 @@ _LOAD_SHARE = 0.2
 """Of the transmitted torque that friction takes, as in gears."""
 CHANGE = 0.1
 """Share of the friction by which it differs between recordings, as gears do that are a few kelvins warmer."""
+REACH = 0.5
+"""From the last link's origin, of the parts of a body at the flange [m], as a standard deviation."""
 _VELOCITY_KNOTS, _POSITION_KNOTS = 11, 9
-"""Of the free functions: velocity in the inverse hyperbolic sine of v / `_SLOW`, position evenly."""
+"""Of the free functions: velocity in the inverse hyperbolic sine of v / `SLOW`, position evenly."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Sampled:
     name: str
     loaded: bool
     motion: Motion
-    """On the fine grid; its `friction` is what the model holds, dry friction turning within `_SLOW` [N m]."""
+    """On the fine grid; its `friction` is what the model holds, dry friction turning within `SLOW` [N m]."""
     tau: Float[np.ndarray, "time dof"]
     """Measured torque [N m], filtered, at the rows that are used."""
     keep: np.ndarray
@@ -101,7 +103,7 @@ def sample(recording: Recording, arm: Arm, loaded: bool) -> Sampled:
     fine = np.arange(s.keep[0] % thin, len(s.time), thin)
     keep = (s.keep - fine[0]) // thin
     q, qd, qdd = (x[fine] for x in (s.q, s.qd, s.qdd))
-    held = np.asarray(arm.damping) * qd + np.asarray(arm.frictionloss) * np.tanh(qd / _SLOW)
+    held = np.asarray(arm.damping) * qd + np.asarray(arm.frictionloss) * np.tanh(qd / SLOW)
     tau = s.tau if thin == 1 else signals_.zero_phase(s.tau, 0.3 * s.rate / thin, s.rate)
     gaps = np.flatnonzero(np.diff(s.keep) > stride) + 1
     bounds = [0, *gaps.tolist(), len(keep)]
@@ -129,13 +131,13 @@ class Scales:
     """Of the free functions; 0 leaves them out."""
     mass: float
     """Of the body [kg]."""
-    extent: float
-    """How far out it may reach from the last link's origin [m]."""
+    carried: float
+    """The same for its first moment and inertia, which are this mass times lengths [kg]."""
 
     @property
     def body(self) -> Float[np.ndarray, "10"]:
-        """Standard deviations of the ten parameters of the body before anything is seen."""
-        return self.mass * np.array([1.0, *[self.extent] * 3, *[self.extent**2] * 6])
+        """Standard deviations of the ten parameters of the body, about the last link's origin."""
+        return np.array([self.mass, *[self.carried * REACH] * 3, *[self.carried * REACH**2] * 6])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +172,7 @@ def design(recordings: Sequence[Sampled], load: Sequence[np.ndarray], scales: Sc
     common, rests, changes = [], [], []
     for r, carried in zip(recordings, load, strict=True):
         v = r.motion.qd
-        dry = np.tanh(v / _SLOW)
+        dry = np.tanh(v / SLOW)
         own = np.stack([v / rms["qd"], dry, np.ones_like(v), r.motion.qdd / rms["qdd"]], -1)
         own = own * scales.torque[:, None]
         columns = np.concatenate([own, (_LOAD_SHARE * dry * np.abs(carried))[..., None]], 2)
@@ -180,8 +182,8 @@ def design(recordings: Sequence[Sampled], load: Sequence[np.ndarray], scales: Sc
                 * np.concatenate(
                     [
                         hats(
-                            np.arcsinh(v[:, j] / _SLOW),
-                            np.arcsinh(together["qd"][:, j] / _SLOW),
+                            np.arcsinh(v[:, j] / SLOW),
+                            np.arcsinh(together["qd"][:, j] / SLOW),
                             _VELOCITY_KNOTS,
                         ),
                         hats(r.motion.q[:, j], together["q"][:, j], _POSITION_KNOTS),

@@ -18,6 +18,7 @@ from ..export import write_document
 from ..feasible.nearest import are_buildable, nearest_buildable
 from ..files import write_json, write_text
 from ..mjcf import MjcfSource, from_document
+from .design import REACH
 from .frame import Frame
 
 SCHEMA = "jaxpanda.payload/1"
@@ -28,6 +29,8 @@ LEVEL = 0.95
 _WIDTH = float(scipy.stats.norm.ppf(0.5 + LEVEL / 2))
 _OPEN = 0.5
 """A direction is open where so much of its prior's deviation is left."""
+_MOSTLY = 0.25
+"""Share of a parameter that open directions make up, for it to be named."""
 _CONTRADICTS = float(scipy.stats.chi2.ppf(LEVEL, 10))
 """Squared distance, in deviations, beyond which no real body is within the uncertainty of the estimate."""
 _SOLID = 2700.0
@@ -87,8 +90,11 @@ class PayloadEstimate:
     """Whether `standard` itself could be built."""
     distance: float | None
     """From there to `body`, in deviations, squared: beyond 18.3 no real body is within the uncertainty."""
+    prior: Float[np.ndarray, "10"]
+    """Standard deviation of each parameter before anything is seen."""
     directions: tuple[dict[str, Any], ...]
-    """Directions of the ten parameters that the motion does not tell."""
+    """What the motion does not tell: `vector`, a direction of the ten parameters in units of their prior, and how
+    much of the prior's deviation is left along it."""
     fit: dict[str, Any]
     """Rms of what is left of the torque [N m], joint by joint, and of what the body's torque is."""
     sentences: tuple[str, ...]
@@ -126,7 +132,11 @@ class PayloadEstimate:
                 "feasible": self.feasible,
                 "distance_to_feasible": self.distance,
             },
-            "not_told": list(self.directions),
+            "not_told": {
+                "names": list(_STANDARD),
+                "prior_std": self.prior.tolist(),
+                "directions": list(self.directions),
+            },
             "commands": self.commands(),
             "mjcf": self.snippet,
             "fit": self.fit,
@@ -142,10 +152,13 @@ class PayloadEstimate:
         m, c = round(float(mass), 4), [round(float(v), 5) for v in com]
         full = [[round(float(v), 6) for v in row] for row in I]
         six = [full[0][0], full[1][1], full[2][2], full[0][1], full[0][2], full[1][2]]
-        stands = [n for n, t in zip(_SIX, self.inertia.told, strict=True) if not t] if self.inertia else []
+        assert self.com is not None
+        assert self.inertia is not None
+        stands = [f"centre of mass {n}" for n, t in zip("xyz", self.com.told, strict=True) if not t]
+        stands += [f"inertia {n}" for n, t in zip(_SIX, self.inertia.told, strict=True) if not t]
         return {
             "frame": self.frame.name,
-            "stand_ins": [f"inertia {n}" for n in stands],
+            "stand_ins": stands,
             "franka": {
                 "setLoad": {
                     "load_mass": m,
@@ -213,8 +226,8 @@ def result_of(
         except InputError as error:
             notes.append(f"{MODEL_XML} was not written: {error}")
     found = PayloadEstimate(
-        verdict, arm, frame, mass, com, moments, phi, covariance, body, feasible, distance, directions, fit, (),
-        tuple(notes), torque_scale_std, snippet, written,
+        verdict, arm, frame, mass, com, moments, phi, covariance, body, feasible, distance, prior, directions,
+        fit, (), tuple(notes), torque_scale_std, snippet, written,
     )  # fmt: skip
     return dataclasses.replace(found, sentences=tuple(_sentences(found)))
 
@@ -233,8 +246,7 @@ def _directions(covariance: np.ndarray, prior: np.ndarray) -> tuple[dict[str, An
         if left < _OPEN:
             break
         v = v * np.sign(v[np.abs(v).argmax()])
-        parts = {n: round(float(x), 2) for n, x in zip(_STANDARD, v, strict=True) if abs(x) > 0.2}
-        out.append({"direction": parts, "left_of_prior": round(left, 3)})
+        out.append({"vector": v.tolist(), "left_of_prior": left})
     return tuple(out)
 
 
@@ -245,7 +257,7 @@ def _real(
     if feasible:
         return phi, 0.0
     com = phi[1:4] / phi[0]
-    com = com * min(1.0, 2 * EXTENT / max(float(np.linalg.norm(com)), 1e-9))
+    com = com * min(1.0, REACH / max(float(np.linalg.norm(com)), 1e-9))
     ball = _ball(float(phi[0])) * np.eye(3)
     begin = np.asarray(inertia.from_com(jnp.asarray(phi[0]), jnp.asarray(com), jnp.asarray(ball)))
     d = np.sqrt(np.diag(covariance))
@@ -308,11 +320,18 @@ def _snippet(body: Float[np.ndarray, "10"], frame: Frame, source: MjcfSource) ->
     taken = {source.model.body(b).name for b in range(source.model.nbody)}
     name = next(n for n in ("payload", *(f"payload_{k}" for k in range(2, 1000))) if n not in taken)
     x, y = frame.R.T[:2]
-    place = f'pos="{markup.numbers(frame.p)}" xyaxes="{markup.numbers([*x, *y])}"'
+    place = "" if frame.name == frame.body else f' pos="{_text(frame.p)}" xyaxes="{_text([*x, *y])}"'
     return (
-        f'<body name="{name}" {place}><inertial pos="{markup.numbers(com)}" mass="{float(mass)!r}" '
-        f'fullinertia="{markup.numbers(_six(I))}"/></body>\n'
+        f'<body name="{name}"{place}><inertial pos="{_text(com)}" mass="{_text([mass])}" '
+        f'fullinertia="{_text(_six(I))}"/></body>\n'
     )
+
+
+def _text(values: Any) -> str:
+    """Numbers to a billionth of the largest, far below any uncertainty here."""
+    values = np.ravel(values)
+    size = max(float(np.abs(values).max()), 1e-12)
+    return " ".join(f"{v:.9g}" for v in np.where(np.abs(values) < 1e-9 * size, 0.0, values))
 
 
 def _written(source: MjcfSource, snippet: str) -> markup.Document:
@@ -364,32 +383,34 @@ def _sentences(found: PayloadEstimate) -> list[str]:
     else:
         said.append(
             "The torque's own scale is taken as right: where it is off by 1 %, mass and inertia are, and no "
-            "recording tells (--torque-scale-std widens the intervals; gains that differ from joint to joint move "
-            "the centre of mass too)."
+            "recording tells (--torque-scale-std widens the intervals; gains that differ from joint to joint "
+            "move the centre of mass too)."
         )
     said.append(f"Centre of mass and axes in {found.frame.says}; inertia is about the centre of mass.")
     if not all(found.com.told):
         axes = ", ".join(a for a, t in zip("xyz", found.com.told, strict=True) if not t)
         said.append(f"The motion does not tell where the centre of mass is along {axes}.")
     if not any(found.inertia.told):
-        most = found.inertia.interval[:3, 1].max()
+        most = float(found.inertia.interval[:3, 1].max())
+        why = (
+            f"all is possible up to {most:.2g} kg·m², that of a body which reaches {EXTENT:g} m from its centre "
+            "of mass"
+            if most >= 0.99 * high * EXTENT**2
+            else f"all that is known is that it is at most {most:.2g} kg·m² about the frame's axes"
+        )
         said.append(
-            f"The motion does not tell the inertia: it is too slow, or turns the body too little. Anything up to "
-            f"{most:.2g} kg·m² is possible (a body that reaches no further than {EXTENT:g} m from its centre of "
-            "mass); where a controller needs a number, that of a solid ball of aluminium stands in."
+            f"The motion does not tell the inertia, which is small for it or moved too slowly: {why}. Where a "
+            "controller needs a number, that of a solid ball of aluminium stands in."
         )
     elif not all(found.inertia.told):
         names = ", ".join(n for n, t in zip(_SIX, found.inertia.told, strict=True) if not t)
-        said.append(
-            f"The motion does not tell the inertia {names}: the range of what it can be stands in its place."
-        )
+        said.append(f"The motion does not tell the inertia {names}: the range of what it can be is given.")
     if found.directions:
-        parts = "; ".join(
-            " ".join(f"{x:+g} {n}" for n, x in d["direction"].items()) for d in found.directions
-        )
+        open_ = np.sum([np.square(d["vector"]) for d in found.directions], 0)
+        names = ", ".join(n for n, share in zip(_STANDARD, open_, strict=True) if share > _MOSTLY)
         said.append(
-            f"{len(found.directions)} of 10 directions of the parameters are open (combinations in units of "
-            f"their prior, inertia about the frame's origin): {parts}."
+            f"Of the 10 parameters about the frame's origin the motion leaves {len(found.directions)} "
+            f"combinations open, mostly of {names}."
         )
     if found.distance is not None and found.distance > _CONTRADICTS:
         said.append(
@@ -399,7 +420,7 @@ def _sentences(found: PayloadEstimate) -> list[str]:
         )
     elif not found.feasible:
         said.append(
-            "The estimate itself is no real body, within its uncertainty: numbers are those of the nearest body "
-            "with a positive semidefinite pseudo-inertia."
+            "The least-squares estimate is no real body (its pseudo-inertia is not positive semidefinite), by no "
+            "more than its uncertainty: the numbers are those of the nearest real body."
         )
     return said
