@@ -135,7 +135,7 @@ def test_a_pair_without_a_body_shows_none_and_old_files_go(tmp_path):
     assert main(command(tmp_path, out)) == 0
     said = json.loads((out / "payload.json").read_text())
     assert said["verdict"] == "no_difference"
-    assert "includes 0" in said["summary"][0]
+    assert "show no difference" in said["summary"][0]
     assert said["com"] is said["inertia"] is said["commands"] is said["mjcf"] is None
     assert {p.name for p in out.iterdir()} == {"payload.json", "mine.txt"}
 
@@ -230,8 +230,9 @@ def test_a_ur_by_its_motor_currents_in_a_turned_tool_frame(ur, tmp_path):
     assert value[1:4] == pytest.approx(body.com, abs=4e-3)
     assert np.mean((interval[:, 0] <= truth) & (truth <= interval[:, 1])) >= 0.8
 
-    scaled = estimated(tmp_path, (user, a, b), torque_scale_std=0.1)
-    assert np.diff(scaled.mass.interval)[0, 0] == pytest.approx(2 * 1.96 * 0.1 * value[0], rel=0.05)
+    scaled = estimated(tmp_path, (user, a, b), torque_scale_std=0.4)
+    assert scaled.verdict == "found"
+    assert np.diff(scaled.mass.interval)[0, 0] == pytest.approx(2 * 1.96 * 0.4 * value[0], rel=0.05)
     assert scaled.com.std == pytest.approx(found.com.std, rel=0.05)
     by_link = estimated(tmp_path, (user, a, b), frame="link6")
     assert by_link.mass.value == pytest.approx(found.mass.value, rel=1e-4)

@@ -27,6 +27,8 @@ EXTENT = 0.3
 """How far from its centre of mass a body at a flange is taken to reach [m], where the motion does not tell."""
 LEVEL = 0.95
 _WIDTH = float(scipy.stats.norm.ppf(0.5 + LEVEL / 2))
+_SEEN = 3.0
+"""Deviations from 0 at which a mass is reported: at 2, one pair in 40 without a body would have one."""
 _OPEN = 0.5
 """A direction is open where so much of its prior's deviation is left."""
 _MOSTLY = 0.25
@@ -201,21 +203,24 @@ def result_of(
     """From parameters in the last link's frame, with their prior's deviations, to what is said of the body."""
     T = np.stack([np.asarray(_moved(jnp.asarray(e), frame)) for e in np.eye(10)], 1)
     phi, covariance = T @ phi, T @ covariance @ T.T
-    low, high = phi[0] + _WIDTH * np.sqrt(covariance[0, 0]) * np.array([-1, 1])
     feasible = bool(phi[0] > 0 and are_buildable(phi[None]))
     directions = _directions(covariance, prior)
     verdict: Verdict = "found"
-    if np.sqrt(covariance[0, 0]) > _OPEN * prior[0]:
+    std = float(np.sqrt(covariance[0, 0]))
+    if std > _OPEN * prior[0]:
         verdict = "not_told"
-    elif high < 0:
-        verdict = "lighter"
-    elif low <= 0:
+    elif abs(phi[0]) < _SEEN * std:
         verdict = "no_difference"
-    body, distance, com, moments, snippet, written = None, None, None, None, None, None
+    elif phi[0] < 0:
+        verdict = "lighter"
+    body, distance = _real(phi, covariance, feasible) if verdict == "found" else (None, None)
+    scaled = phi if body is None else body  # which the scale of all torque leaves a body, or none
+    covariance = covariance + torque_scale_std**2 * np.outer(scaled, scaled)
+    low, high = phi[0] + _WIDTH * np.sqrt(covariance[0, 0]) * np.array([-1, 1])
+    com, moments, snippet, written = None, None, None, None
     mass = Numbers(phi[:1], np.sqrt(covariance[:1, 0]), np.array([[low, high]]), (verdict != "not_told",))
     notes = list(notes)
-    if verdict == "found":
-        body, distance = _real(phi, covariance, feasible)
+    if body is not None:
         com, moments = _numbers(body, covariance, high)
         body = _with_stand_ins(body, com, moments)
         mass = Numbers(body[:1], mass.std, mass.interval, mass.told)
@@ -365,8 +370,9 @@ def _sentences(found: PayloadEstimate) -> list[str]:
         ]
     if found.verdict == "no_difference":
         return [
-            f"Recordings with and without the body show no difference: its mass is {found.mass.value[0]:.3g} kg, "
-            f"{between}, which includes 0. No payload is reported."
+            "Recordings with and without the body show no difference that tells a body from none: its mass is "
+            f"{found.mass.value[0]:.2g} kg, {between}, less than {_SEEN:g} deviations from 0. No payload is "
+            "reported."
         ]
     if found.verdict == "lighter":
         return [
