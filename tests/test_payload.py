@@ -112,7 +112,7 @@ def test_the_terminal_says_what_robots_take(files, tmp_path, capsys):
 def test_intervals_of_twenty_pairs_hold_the_truth(tmp_path):
     inside, off = [], []
     for seed in range(100, 120):
-        found = estimated(tmp_path, pairs.panda_pair(seed, seconds=8.0))
+        found = estimated(tmp_path, pairs.panda_pair(seed, seconds=6.0))
         value, interval = numbers(found)
         inside.append((interval[:, 0] <= TRUTH) & (interval[:, 1] >= TRUTH))
         off.append(value - TRUTH)
@@ -141,8 +141,10 @@ def test_a_pair_without_a_body_shows_none_and_old_files_go(tmp_path):
 
 
 def test_swapped_recordings_are_told(files):
+    """Several of either kind, and of other lengths, are as good as one."""
     _, without, loaded = pairs.panda_pair(0, seconds=8.0)
-    found = estimate_payload(files / "user.xml", [loaded], [without])
+    _, more, _ = pairs.panda_pair(0, seconds=5.0)
+    found = estimate_payload(files / "user.xml", [loaded], [without, dataclasses.replace(more, name="more")])
     assert found.verdict == "lighter"
     assert "swapped" in found.sentences[0]
     assert found.snippet is None
@@ -190,14 +192,18 @@ def test_poses_held_at_rest_are_enough_for_mass_and_centre_of_mass(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def ur() -> str:
-    """A UR10e as its public numbers have it, with a tool frame that is turned against its last link."""
+def real():
+    """Models and loaders of the experiment on real arms."""
     folder = Path(__file__).parents[1] / "experiments" / "real_arms"
     sys.path.insert(0, str(folder))
-    try:
-        text = importlib.import_module("arms").ur10e([5.0, 5.0, 3.0, 0.5, 0.5, 0.4])
-    finally:
-        sys.path.remove(str(folder))
+    yield {name: importlib.import_module(name) for name in ("arms", "recordings")}
+    sys.path.remove(str(folder))
+
+
+@pytest.fixture(scope="module")
+def ur(real) -> str:
+    """A UR10e as its public numbers have it, with a tool frame that is turned against its last link."""
+    text = real["arms"].ur10e([5.0, 5.0, 3.0, 0.5, 0.5, 0.4])
     last = re.search(r'<joint name="joint6"[^>]*>', text)
     assert last is not None
     site = '<site name="tool0" pos="0.01 -0.02 0.11655" euler="0.3 -0.4 2.0"/>'
@@ -290,3 +296,18 @@ def test_both_kinds_of_recordings_are_needed(files):
     _, without, _ = pairs.panda_pair(0, seconds=8.0)
     with pytest.raises(InputError, match="no recording with the body"):
         estimate_payload(files / "user.xml", [without], [])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gains", ["main.m", "UR10E_parameters.txt"])
+def test_the_real_ur10e_carries_its_load_within_what_its_gains_leave_open(real, data, tmp_path, gains):
+    (tmp_path / "ur.xml").write_text(real["arms"].ur10e())
+    of = lambda name: real["recordings"].ur10e(data, name, gains)
+    unloaded, loaded = of("02_19_14harm50sec"), of("02_19_14harm50secLoad")
+    found = estimate_payload(tmp_path / "ur.xml", [unloaded], [loaded], torque_scale_std=0.1)
+    assert found.verdict == "found"
+    assert found.mass.interval[0, 0] < 2.805 < found.mass.interval[0, 1]
+    assert np.diff(found.mass.interval)[0, 0] < 1.4
+    other = estimate_payload(tmp_path / "ur.xml", [of("02_12-50sec_12harm")], [unloaded])
+    assert other.verdict == "no_difference"
+    assert np.abs(other.mass.interval).max() < 0.1

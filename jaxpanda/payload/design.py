@@ -144,8 +144,8 @@ class Scales:
 class Design:
     """Columns of every recording, each in units of its prior; the body's ten come last."""
 
-    A: tuple[Float[np.ndarray, "dof time unknowns"], ...]
-    y: tuple[Float[np.ndarray, "dof time"], ...]
+    A: tuple[Float[np.ndarray, "dof _time unknowns"], ...]
+    y: tuple[Float[np.ndarray, "dof _time"], ...]
     friction: Float[np.ndarray, "dof unknowns"]
     """1 at the columns that make up a joint's friction in all recordings, else 0."""
     links: Float[np.ndarray, " standard"]

@@ -224,7 +224,7 @@ def _white(noise: Noise) -> Noise:
     return Noise(np.zeros_like(noise.a), noise.sigma)
 
 
-def _rms(left: Sequence[Float[np.ndarray, "dof time"]]) -> Float[np.ndarray, " dof"]:
+def _rms(left: Sequence[Float[np.ndarray, "dof _time"]]) -> Float[np.ndarray, " dof"]:
     return np.sqrt(np.mean(np.concatenate(left, 1) ** 2, 1))
 
 

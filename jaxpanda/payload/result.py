@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..export import write_document
 from ..feasible.nearest import are_buildable, nearest_buildable
 from ..files import write_json, write_text
-from ..mjcf import MjcfSource, from_document
+from ..mjcf import MjcfSource, from_document, move_standard
 from .design import REACH
 from .frame import Frame
 
@@ -201,7 +201,8 @@ def result_of(
     torque_scale_std: float,
 ) -> PayloadEstimate:
     """From parameters in the last link's frame, with their prior's deviations, to what is said of the body."""
-    T = np.stack([np.asarray(_moved(jnp.asarray(e), frame)) for e in np.eye(10)], 1)
+    R, p = frame.R_link.T, -frame.R_link.T @ frame.p_link
+    T = np.stack([move_standard(one, R, p) for one in np.eye(10)], 1)
     phi, covariance = T @ phi, T @ covariance @ T.T
     feasible = bool(phi[0] > 0 and are_buildable(phi[None]))
     directions = _directions(covariance, prior)
@@ -235,11 +236,6 @@ def result_of(
         fit, (), tuple(notes), torque_scale_std, snippet, written,
     )  # fmt: skip
     return dataclasses.replace(found, sentences=tuple(_sentences(found)))
-
-
-def _moved(phi, frame: Frame):
-    """Parameters in the frame, given those in the last link's."""
-    return inertia.move(phi, jnp.asarray(frame.R_link.T), jnp.asarray(-frame.R_link.T @ frame.p_link))
 
 
 def _directions(covariance: np.ndarray, prior: np.ndarray) -> tuple[dict[str, Any], ...]:
@@ -280,17 +276,22 @@ def _six(I: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "6"]:
     return I[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
+@jax.jit
+def _about_com(phi):
+    """Centre of mass and inertia about it (xx, yy, zz, xy, xz, yz), and their derivatives by the parameters."""
+
+    def of(phi):
+        _, com, I = inertia.to_com(phi)
+        return jnp.concatenate([com, inertia.six(I)[np.array(_PLACE)]])
+
+    return of(phi), jax.jacobian(of)(phi)
+
+
 def _numbers(
     body: Float[np.ndarray, "10"], covariance: Float[np.ndarray, "10 10"], heaviest: float
 ) -> tuple[Numbers, Numbers]:
     """Centre of mass and inertia about it, with deviations to first order."""
-
-    def both(phi):
-        _, com, I = inertia.to_com(phi)
-        return jnp.concatenate([com, inertia.six(I)[np.array(_PLACE)]])
-
-    value = np.asarray(both(jnp.asarray(body)))
-    J = np.asarray(jax.jacobian(both)(jnp.asarray(body)))
+    value, J = (np.asarray(x) for x in _about_com(jnp.asarray(body)))
     std = np.sqrt(np.diag(J @ covariance @ J.T))
     interval = value[:, None] + _WIDTH * std[:, None] * np.array([-1.0, 1.0])
     most = heaviest * EXTENT**2
