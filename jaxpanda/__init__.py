@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .identification import identify as identify
     from .identification import identify_mass_gravity as identify_mass_gravity
     from .inspection import inspect as inspect
+    from .payload import estimate_payload as estimate_payload
     from .pipeline import to_mjcf as to_mjcf
     from .recordings import Recording as Recording
     from .recordings import load as load
@@ -49,6 +50,7 @@ _HOME = {
     "Retrieval": "retrieval",
     "demonstrate": "demo",
     "diagnose": "diagnosis",
+    "estimate_payload": "payload",
     "predict": "diagnosis",
     "identify": "identification",
     "identify_mass_gravity": "identification",

@@ -237,7 +237,40 @@ class Predict:
         return diagnosis.predict_files(self.diagnosis, self.recording, self.out)
 
 
-_COMMANDS = (Demo, Inspect, Identify, Retrieve, Export, Validate, Diagnose, Predict)
+@dataclasses.dataclass(frozen=True)
+class Payload:
+    """The body on the flange, from recordings without and with it: mass, centre of mass, inertia."""
+
+    without: tuple[Path, ...]
+    """Recordings of the arm without the body."""
+    with_: Annotated[tuple[Path, ...], tyro.conf.arg(name="with")]
+    """Recordings of the same arm with it; other motions will do."""
+    out: Path
+    """Folder for payload.json, payload.xml and with_payload.xml."""
+    model: Path | None = None
+    """The simulation as you have it (MJCF); without it, the project's own Panda."""
+    frame: str = ""
+    """Body or site of the MJCF, fixed to the last link, in which to tell the result; without it, one that is
+    called a flange, else the last link's body."""
+    torque_scale_std: float = 0.0
+    """By which share all torques may be off together, as 0.1 for motor currents times gains known to 10 %."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import payload
+
+        return payload.payload_files(
+            self.out,
+            self.model,
+            self.without,
+            self.with_,
+            frame=self.frame,
+            torque_scale_std=self.torque_scale_std,
+        )
+
+
+_COMMANDS = (Demo, Inspect, Identify, Retrieve, Export, Validate, Diagnose, Predict, Payload)
 
 
 def _parse(arguments: list[str]) -> Any:
@@ -273,7 +306,9 @@ def _sentence(arguments: list[str], panel: str) -> str:
         known = [*commands, "--help", "--version"]
         what = f"no command {name!r}{_meant(name, known)}" if name else "no command given"
         return f"{what}; there are {', '.join(commands)}: see jaxpanda --help"
-    fields = {"--" + field.name.replace("_", "-"): field for field in dataclasses.fields(commands[name])}
+    fields = {
+        "--" + field.name.rstrip("_").replace("_", "-"): field for field in dataclasses.fields(commands[name])
+    }
     given = _options(arguments)
     words = " ".join(line.strip("╭╮╰╯│─+|- ") for line in panel.splitlines())  # a frame, of lines or of ASCII
     text = " ".join(re.sub(r"[-─]{3,}", " ", words).split())

@@ -332,6 +332,40 @@ def outcome_figure(objective: Float[np.ndarray, " start"], lower_bound: float | 
     return Figure(draw, "Objective of every random start", size=(7.0, 3.0))
 
 
+def payload(found: Any) -> Sequence[Section]:
+    """The body at the flange, and what robots take as its numbers."""
+    rows = [_told("mass [kg]", found.mass, 0)]
+    if found.com is not None:
+        rows += [_told(f"centre of mass {axis} [m]", found.com, k) for k, axis in enumerate("xyz")]
+        names = ("xx", "yy", "zz", "xy", "xz", "yz")
+        rows += [_told(f"inertia {name} [kg·m²]", found.inertia, k) for k, name in enumerate(names)]
+    sections = [
+        Section("Payload", found.sentences, [Table(["", "value", "from", "to"], rows, "95 % intervals")])
+    ]
+    if (takes := found.commands()) is not None:
+        load, note = takes["franka"]["setLoad"], takes["franka"]["note"]
+        inside = [f"Numbers in the frame of {takes['frame']!r}; {note}."]
+        if takes["stand_ins"]:
+            inside.append(f"Not told by the motion, a stand-in: {', '.join(takes['stand_ins'])}.")
+        inside += [
+            f"Franka Desk / setLoad: mass {load['load_mass']}, F_x_Cload {load['F_x_Cload']}, "
+            f"load_inertia {load['load_inertia']}",
+            f"UR: {takes['ur']['script']} ({takes['ur']['note']})",
+            f"MJCF, in the body {found.frame.body!r}: {found.snippet.strip()}",
+        ]
+        sections.append(Section("What controllers and MuJoCo take", inside))
+    if found.notes:
+        sections.append(Section("Notes", found.notes))
+    return sections
+
+
+def _told(name: str, numbers: Any, k: int) -> list[str]:
+    """A row: a number and its interval, or the range of what it can be."""
+    low, high = numbers.interval[k]
+    value = f"{numbers.value[k]:.5g}" if numbers.told[k] else "not told"
+    return [name, value, f"{low:.4g}", f"{high:.4g}"]
+
+
 _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Inspections": inspections,
     "Identification": identification,
@@ -341,5 +375,6 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Diagnosis": diagnosis,
     "AtRest": diagnosis,
     "Prediction": prediction,
+    "PayloadEstimate": payload,
     "Demonstration": lambda result: result.sections,
 }
