@@ -250,11 +250,6 @@ class Problem:
         return families([*self.library, *self.catchalls], self.dof)
 
     @functools.cached_property
-    def _cache(self) -> dict:
-        """For what a search wants to keep."""
-        return {}
-
-    @functools.cached_property
     def likeliest_shapes(self) -> dict[tuple, AbstractEffect]:
         """Where searches over the shapes of an effect at a place have ended last."""
         return {}
@@ -293,6 +288,15 @@ class Problem:
                 rows = self.whitened(term.at_joint(joint), noise, joint) if acts else None
                 here.terms[id(term)] = term, rows
         return here
+
+    def forget(self, term: Term) -> None:
+        """Give back what was kept of a term that was tried: a search tries thousands."""
+        for here in self._joints.values():
+            _, rows = here.terms.pop(id(term), (term, None))
+            if rows is not None:
+                here.products = {k: v for k, v in here.products.items() if id(term) not in k}
+                for _, kept in here.blocks.values():
+                    kept.pop(id(term), None)
 
     def whitened_joints(self, noise: Noise, terms: Sequence[Term]) -> list[Whitened]:
         """`whitened_joint` of all."""

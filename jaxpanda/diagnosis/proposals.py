@@ -13,7 +13,7 @@ from .evidence import Design, Noise, log_mean_exp
 from .host import parallel
 from .library import Candidates
 from .problem import Problem
-from .shapes import first_steps, refine
+from .shapes import evidence_of, first_steps, refine
 
 _REFINED = 4
 _CLOSE, _HOPELESS = 0.5, 5.0
@@ -80,6 +80,15 @@ def by_place(proposals: Sequence[Proposal]) -> dict[int | None, list[Proposal]]:
     for p in proposals:
         joint = p.effect.joints[0] if isinstance(p.effect, AbstractJointEffect) else None
         out.setdefault(joint, []).append(p)
+    return out
+
+
+def plainer(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> list[Proposal]:
+    """A proposal in its plainer forms, which have no shape to be searched for."""
+    out, places = [], _places(problem)
+    for effect in proposal.effect.plainer:
+        best, deviation = evidence_of(problem, design, noise, effect)
+        out.append(with_prior(Proposal(effect, best, best, deviation, ()), places[effect.name]))
     return out
 
 

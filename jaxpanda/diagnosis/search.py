@@ -5,7 +5,6 @@ of its effects. Steps add a term, drop one, put another or two in its place, or 
 of them knows an effect. What is left is a local optimum, and its neighbours, which `posterior` weighs.
 """
 
-import dataclasses
 from collections.abc import Collection, Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from .credible import fitted
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem, Term
-from .proposals import by_place, grids, ranked, with_prior
+from .proposals import by_place, grids, plainer, ranked, with_prior
 from .shapes import evidence_of, first_steps, refine
 from .state import (
     State,
@@ -121,25 +120,8 @@ def choices(
             more = problem.design((*terms, term), noise)
             if is_possible(term, more):
                 out.append((more.log_evidence - own + term.prior, (term,)))
+            problem.forget(term)
     return sorted(out, key=lambda choice: -choice[0])
-
-
-def plainer(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> list[Proposal]:
-    """A proposal in its plainer forms."""
-    out = []
-    for effect in proposal.effect.plainer:
-        best, deviation = evidence_of(problem, design, noise, effect)
-        gained = best - proposal.best
-        out.append(
-            dataclasses.replace(
-                proposal,
-                effect=effect,
-                best=best,
-                deviation=deviation,
-                evidence=proposal.evidence + gained,
-            )
-        )
-    return out
 
 
 def is_possible(term: Term, design: Design) -> bool:
@@ -264,26 +246,19 @@ def instead(problem: Problem, state: State, i: int, free: bool = True) -> list[C
     """What each effect would bring in a term's place, where the term acts, the likeliest first; the term itself
     is among them."""
     others = tuple(t for k, t in enumerate(state.terms) if k != i)
-    key = ("instead", free, *map(id, others), id(state.terms[i]), id(state.noise))
-    cache = problem._cache
-    if key not in cache:
-        term, rest = state.terms[i], without(state, i)
-        acts = set(term.effect.joints) if isinstance(term.effect, AbstractJointEffect) else {
-            int(j) for j in np.flatnonzero(state.shares[i] > _FELT)
-        }  # fmt: skip
-        proposals = _new(others, ranked(problem, rest, state.noise, acts), free)
-        found = choices(problem, others, rest, state.noise, proposals)
-        if not term.effect.bound_to_recording and len(state.terms) <= _FEW:
-            rivals = [choice for choice in found if choice[1][0].key != term.key][:_PAIRED]
-            found += [
-                pair
-                for one in rivals
-                if (pair := _with_another(problem, others, state.noise, one, acts, free))
-            ]
-        own = state.design.log_evidence - rest.log_evidence + term.prior
-        found = sorted([(own, (term,)), *found], key=lambda choice: -choice[0])
-        cache[key] = (found, state)  # the state is kept, lest its parts' identities be used again
-    return cache[key][0]
+    term, rest = state.terms[i], without(state, i)
+    acts = set(term.effect.joints) if isinstance(term.effect, AbstractJointEffect) else {
+        int(j) for j in np.flatnonzero(state.shares[i] > _FELT)
+    }  # fmt: skip
+    proposals = _new(others, ranked(problem, rest, state.noise, acts), free)
+    found = choices(problem, others, rest, state.noise, proposals)
+    if not term.effect.bound_to_recording and len(state.terms) <= _FEW:
+        rivals = [choice for choice in found if choice[1][0].key != term.key][:_PAIRED]
+        found += [
+            pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts, free))
+        ]
+    own = state.design.log_evidence - rest.log_evidence + term.prior
+    return sorted([(own, (term,)), *found], key=lambda choice: -choice[0])
 
 
 def _with_another(

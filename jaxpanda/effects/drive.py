@@ -120,6 +120,11 @@ class JointSpring(AbstractInstantEffect):
         }[self.form]
 
     @property
+    def form_prior(self) -> float:
+        """One spring in twenty stiffens or gets slack where the joint moves."""
+        return -3.0 if self.form in ("cubic", "slack") else 0.0
+
+    @property
     def plainer(self) -> tuple["JointSpring", ...]:
         return (dataclasses.replace(self, form="linear"),) if self.form in ("cubic", "slack") else ()
 
