@@ -12,16 +12,17 @@ from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.credible import is_of_time
 from jaxpanda.diagnosis.decide import MISLEADS, findings
 from jaxpanda.diagnosis.diagnosis import Fit, verdict
+from jaxpanda.diagnosis.events import windows
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.proposals import grids
 from jaxpanda.diagnosis.search import climb, search
 from jaxpanda.diagnosis.shapes import refine
-from jaxpanda.diagnosis.state import places, start, with_terms
+from jaxpanda.diagnosis.state import likelier, places, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.drive import JointSpring
-from jaxpanda.effects.friction import CoulombFriction
+from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
 from jaxpanda.effects.sensing import TorqueDrift, TorqueOffset
 
 
@@ -186,6 +187,49 @@ def test_what_comes_again_with_the_motion_is_no_drift(bias, drifts):
     assert isinstance(drift.effect, TorqueDrift)
     assert drift.evidence > 250
     assert is_of_time(problem, state.design, state.noise, drift) is drifts
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_a_force_that_every_repeat_of_the_motion_shows_is_no_event(again):
+    """On the real Panda contacts and bodies taken up stood in for what the posture decides."""
+
+    def pushed(t, q, qd, qdd):
+        on = (t % 10.0 > 4.0) & (t % 10.0 < 5.0) & (again | (t < 10.0))
+        force = np.broadcast_to([0.0, 6.0, 0.0, 0.0, 0.0, 0.0], (len(t), 6))
+        columns = Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)).wrench_columns[:, 6]
+        return on[:, None] * np.einsum("tjk,tk->tj", columns, force)
+
+    problem = posed(record(5, pushed, seconds=20.0))
+    state = start(problem)
+    found = [p for p in windows(problem, state.design, state.noise) if p.key[0] == "external_contact"]
+    push = refine(problem, state.design, state.noise, max(found, key=lambda p: p.evidence))
+    assert push.evidence > 50
+    assert is_of_time(problem, state.design, state.noise, push) is not again
+
+
+def test_of_two_models_the_one_with_the_law_is_likelier_whichever_comes_first():
+    rubs = lambda t, q, qd, qdd: 0.5 * qd[:, [2]] * np.eye(7)[2]
+    problem = posed(record(5, rubs))
+    nothing = start(problem)
+    law = with_terms(problem, [problem.term(ViscousFriction(2), np.array([1.0]))])
+    gained = likelier((problem, nothing), (problem, law))
+    assert gained > law.score - nothing.score > 100
+    assert likelier((problem, law), (problem, nothing)) == pytest.approx(-gained)
+    assert likelier((problem, law), (problem, law)) == 0
+
+
+def test_what_was_tried_is_forgotten_and_found_again_alike():
+    rubs = lambda t, q, qd, qdd: 0.5 * qd[:, [2]] * np.eye(7)[2]
+    problem = posed(record(5, rubs))
+    noise = start(problem).noise
+    law = problem.term(ViscousFriction(2), np.array([1.0]))
+    before = problem.design([law], noise).log_evidence
+    kept = [dict(here.products) for here in problem.whitened_joints(noise, ())]
+    problem.forget(law)
+    for here, had in zip(problem.whitened_joints(noise, ()), kept, strict=True):
+        assert id(law) not in here.terms
+        assert here.products.keys() == {k for k in had if id(law) not in k}
+    assert problem.design([law], noise).log_evidence == before
 
 
 def test_friction_that_changes_from_one_repeat_to_the_next_is_a_drift_whatever_stays():
