@@ -133,7 +133,7 @@ def is_possible(term: Term, design: Design) -> bool:
     return bool(np.all(design.x[at] > -_NEGATIVE * deviation))
 
 
-def grow(problem: Problem, state: State, say: Any, free: bool) -> State:
+def grow(problem: Problem, state: State, say: Any, free: bool = True) -> State:
     """Add the likeliest effect while it makes the model likelier, and with it the likeliest at other joints."""
     proposals, joints = [], None
     while len(state.terms) < _MOST:
@@ -180,7 +180,7 @@ def prune(problem: Problem, state: State, say: Any) -> State:
     return state
 
 
-def exchange(problem: Problem, state: State, say: Any, free: bool) -> State:
+def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> State:
     """Put in the place of each term what is likelier there."""
     for i in range(len(state.terms)):
         if not _is_new(problem, ("exchange", free), state, (i,)):
@@ -206,7 +206,7 @@ def _is_new(problem: Problem, step: tuple[str, bool], state: State, which: Seque
     return True
 
 
-def merge(problem: Problem, state: State, say: Any, free: bool) -> State:
+def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
     """One term in the place of several that act together: of all in a joint, or of a pair."""
     while True:
         groups = [
