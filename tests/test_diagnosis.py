@@ -32,10 +32,11 @@ from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.drive import Backlash, JointElasticity
-from jaxpanda.effects.friction import FrictionDrift, StribeckFriction
+from jaxpanda.effects.friction import FrictionDrift
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.motion import masses
 from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.effects.stribeck import StribeckFriction
 from jaxpanda.export import panda_mjcf
 from jaxpanda.feasible.nearest import are_buildable
 from jaxpanda.files import write_json

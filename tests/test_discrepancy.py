@@ -25,11 +25,11 @@ from jaxpanda.effects.friction import (
     FrictionDrift,
     LoadDependentFriction,
     PowerLawFriction,
-    StribeckFriction,
     ViscousFriction,
 )
 from jaxpanda.effects.memory import STICKS, PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.effects.stribeck import StribeckFriction
 
 DAMPING = 20.0
 

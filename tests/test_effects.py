@@ -28,6 +28,7 @@ from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.load import GravityDirection, InertialParameters, Payload, PayloadChange
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TimeDelay, TorqueDrift
+from jaxpanda.effects.stribeck import StribeckBristles
 from jaxpanda.effects.twist import Law, twist_torque
 from jaxpanda.effects.unknown import Unknown, UnknownAt, UnknownOfTwo
 
@@ -64,6 +65,7 @@ def channels(motion: Motion) -> Channels:
 def shapes(arm: Arm):
     """One shape of every form of every effect, those that only a scan proposes included."""
     proposed = [
+        StribeckBristles(3, 0.1, 2e-3, 1.5),
         TorqueRipple(1, 20.0, "one"),
         TorqueRipple(1, 20.0, "two"),
         JointSpring(3, "slack", -1.5, 0.05),

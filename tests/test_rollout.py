@@ -20,10 +20,11 @@ from jaxpanda import Arm, InputError, markup, rollout
 from jaxpanda.corrected import Corrected, Plant
 from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.drive import Backlash, JointElasticity
-from jaxpanda.effects.friction import CoulombFriction, LoadDependentFriction, StribeckFriction
+from jaxpanda.effects.friction import CoulombFriction, LoadDependentFriction
 from jaxpanda.effects.load import Payload, PayloadChange
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TorqueOffset
+from jaxpanda.effects.stribeck import StribeckFriction
 from jaxpanda.effects.unknown import Unknown, UnknownAt, UnknownOfTwo
 from jaxpanda.mjcf import from_document, move_standard
 from jaxpanda.recordings import Recording, save

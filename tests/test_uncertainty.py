@@ -13,7 +13,7 @@ from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.diagnosis.uncertainty import covariances, polished
 from jaxpanda.effects import AbstractEffect, Motion
 from jaxpanda.effects.drive import TorqueRipple
-from jaxpanda.effects.friction import StribeckFriction
+from jaxpanda.effects.stribeck import StribeckFriction
 
 ARM = Arm.panda()
 NOISE, CORRELATED = 0.05, 0.9

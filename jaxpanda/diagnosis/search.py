@@ -326,11 +326,11 @@ def settle(problem: Problem, state: State, count: int = 1) -> State:
     for newest in range(len(share) - count, len(share)):
         older = [i for i in range(len(share) - count) if share[i] @ share[newest] > _OVERLAP]
         for i in (newest, *older[::-1][: _SETTLED - 1]):
-            state = settled(problem, state, i)
+            state = reshaped(problem, state, i)
     return state
 
 
-def settled(problem: Problem, state: State, i: int) -> State:
+def reshaped(problem: Problem, state: State, i: int) -> State:
     """The model with the shape of a term refined again, where that makes it likelier."""
     term = state.terms[i]
     if not term.effect.shapes:

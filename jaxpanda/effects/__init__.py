@@ -1,6 +1,6 @@
 """The catalogue of physics beyond rigid bodies: one class an effect, one file a family."""
 
-from . import contact, drive, friction, load, memory, sensing, unknown
+from . import contact, drive, friction, load, memory, sensing, stribeck, unknown
 from .effect import AbstractArmEffect as AbstractArmEffect
 from .effect import AbstractEffect as AbstractEffect
 from .effect import AbstractInstantEffect as AbstractInstantEffect
@@ -21,6 +21,7 @@ from .motion import smooth_torque as smooth_torque
 
 CATALOGUE = (
     *friction.EFFECTS,
+    *stribeck.EFFECTS,
     *memory.EFFECTS,
     *drive.EFFECTS,
     *load.EFFECTS,

@@ -260,79 +260,6 @@ class AsymmetricFriction(AbstractDryFriction):
         )
 
 
-class StribeckFriction(AbstractDryFriction):
-    r"""Friction that falls with speed near zero velocity.
-
-    $$\tau_j = \left(F_c + (F_s - F_c)\,e^{-(|\dot q_j|/v_s)^\delta}\right) \tanh(\dot q_j / v_0)$$
-
-    Form "extra" leaves out $F_c$, for a joint whose model holds it already.
-
-    References:
-        Armstrong-Hélouvry 1991; Olsson et al., European Journal of Control 1998.
-    """
-
-    name: ClassVar[str] = "stribeck_friction"
-    shapes: ClassVar[tuple[Shape, ...]] = (
-        Shape("stribeck_velocity", "rad/s", 5e-3, 0.6),
-        Shape("v0", "rad/s", 1e-3, 0.05),
-    )
-    reveals: ClassVar[str] = "slow ramps through zero velocity, in several poses"
-    prior: ClassVar[float] = -28.0
-    confounded_with: ClassVar[tuple[str, ...]] = (
-        "coulomb_friction",
-        "presliding_hysteresis",
-        "viscous_friction",
-    )
-
-    joint: Joint
-    stribeck_velocity: Float[Array, ""] | float
-    v0: Float[Array, ""] | float
-    exponent: Float[Array, ""] | float
-    form: str = eqx.field(static=True)
-
-    @classmethod
-    def grid(cls, arm: Arm) -> Sequence["StribeckFriction"]:
-        return [
-            cls(j, vs, v0, exponent, form)
-            for form in ("whole", "extra", "viscous")
-            for exponent in ((1.0, 2.0) if form != "viscous" else (2.0,))
-            for vs in (0.02, 0.05, 0.1, 0.2, 0.35)
-            for v0 in ((0.004, 0.02) if vs > 0.03 else (0.004,))
-            for j in range(arm.dof)
-        ]
-
-    @property
-    def may_hold(self) -> frozenset[str]:
-        return frozenset({CoulombFriction.name})
-
-    @property
-    def held(self) -> tuple[type[AbstractEffect], ...]:
-        return {"whole": (CoulombFriction,), "viscous": (CoulombFriction, ViscousFriction)}.get(self.form, ())
-
-    @property
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        level, excess = Coefficient("coulomb", "N·m", sign=1), Coefficient("static_excess", "N·m", sign=1)
-        slope = Coefficient("damping", "N·m·s/rad", sign=1)
-        return {"whole": (level, excess), "extra": (excess,), "viscous": (level, excess, slope)}[self.form]
-
-    @property
-    def equation(self) -> str:
-        bump = "static_excess * exp(-(|dq| / stribeck_velocity)^exponent)"
-        law = bump if self.form == "extra" else f"(coulomb + {bump})"
-        return f"tau = {law} * tanh(dq / v0)" + (" + damping * dq" if self.form == "viscous" else "")
-
-    def levels(self, s: Channels) -> Float[Array, " n"]:
-        speed = jnp.abs(s.qd[self.joint])
-        bump = jnp.exp(-((speed / self.stribeck_velocity + 1e-12) ** self.exponent))
-        one, none = jnp.ones_like(bump), jnp.zeros_like(bump)
-        return jnp.stack({"whole": [one, bump], "extra": [bump], "viscous": [one, bump, none]}[self.form])
-
-    def remainder(self, s: Channels) -> Float[Array, " n"]:
-        qd = s.qd[self.joint]
-        none = jnp.zeros_like(qd)
-        return jnp.stack({"whole": [none, none], "extra": [none], "viscous": [none, none, qd]}[self.form])
-
-
 class LoadDependentFriction(AbstractDryFriction):
     r"""Friction that grows with the transmitted torque.
 
@@ -547,7 +474,6 @@ EFFECTS = (
     CoulombFriction,
     PowerLawFriction,
     AsymmetricFriction,
-    StribeckFriction,
     LoadDependentFriction,
     FrictionDrift,
 )

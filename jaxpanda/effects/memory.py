@@ -109,18 +109,14 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         return {"frictionloss": {int(self.joint): level}}
 
     def start(self, s: Channels) -> Float[Array, " states"]:
-        return smooth_sign(s.qd[self.joint], 0.01)[None]
+        return turned(s.qd[self.joint])[None]
 
     def step(
         self, z: Float[Array, " states"], s: Channels, dt: Seconds
     ) -> tuple[Float[Array, " states"], Float[Array, " n"]]:
         qd = s.qd[self.joint]
         moved = qd * dt / self.breakaway_distance
-        if self._law == "jenkins":
-            z = jnp.clip(z + moved, -1.0, 1.0)
-        else:
-            sign = jnp.sign(qd)
-            z = sign + (z - sign) * jnp.exp(-jnp.abs(moved))
+        z = jnp.clip(z + moved, -1.0, 1.0) if self._law == "jenkins" else bristle(z, moved)
         if self._law == "lugre":
             return z, jnp.concatenate([z, qd - z * jnp.abs(qd)])
         sign = smooth_sign(qd, _WIDTH)[None]
@@ -146,6 +142,17 @@ class PreslidingHysteresis(AbstractMemoryEffect):
             level = {"only": jnp.zeros_like(c[0]), "extra": -c[0], "whole": c[-1]}[self._extent]
             damping = level * sign_over_velocity(s.qd[self.joint], _WIDTH)
         return Resistance(self._here(c[0] * z[0], s), self._here(damping, s), z)
+
+
+def bristle(z: Float[Array, " states"], moved: Float[Array, ""]) -> Float[Array, " states"]:
+    """Dahl's bristles after a motion over so many breakaway distances: exact where the direction stays."""
+    sign = jnp.sign(moved)
+    return sign + (z - sign) * jnp.exp(-jnp.abs(moved))
+
+
+def turned(qd: Float[Array, ""]) -> Float[Array, ""]:
+    """What bristles are taken for at the first instant: turned all the way, unless the joint is at rest."""
+    return smooth_sign(qd, 0.01)
 
 
 _WIDTH = 0.005

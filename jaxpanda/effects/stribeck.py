@@ -1,0 +1,172 @@
+"""Friction that falls with speed near zero velocity."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..arm import Arm
+from .effect import (
+    AbstractDryFriction,
+    AbstractEffect,
+    AbstractMemoryEffect,
+    Coefficient,
+    Seconds,
+    Shape,
+)
+from .friction import CoulombFriction, ViscousFriction
+from .memory import bristle, turned
+from .motion import Channels, Joint
+
+_DISTANCES = (5e-4, 2e-3, 8e-3)
+_VELOCITY = Shape("stribeck_velocity", "rad/s", 5e-3, 0.6)
+
+
+class StribeckFriction(AbstractDryFriction):
+    r"""Friction that falls with speed near zero velocity.
+
+    $$\tau_j = \left(F_c + (F_s - F_c)\,e^{-(|\dot q_j|/v_s)^\delta}\right) \tanh(\dot q_j / v_0)$$
+
+    Form "extra" leaves out $F_c$, for a joint whose model holds it already.
+
+    References:
+        Armstrong-Hélouvry 1991; Olsson et al., European Journal of Control 1998.
+    """
+
+    name: ClassVar[str] = "stribeck_friction"
+    shapes: ClassVar[tuple[Shape, ...]] = (
+        _VELOCITY,
+        Shape("v0", "rad/s", 1e-3, 0.05),
+    )
+    reveals: ClassVar[str] = "slow ramps through zero velocity, in several poses"
+    prior: ClassVar[float] = -28.0
+    confounded_with: ClassVar[tuple[str, ...]] = (
+        "coulomb_friction",
+        "presliding_hysteresis",
+        "viscous_friction",
+    )
+
+    joint: Joint
+    stribeck_velocity: Float[Array, ""] | float
+    v0: Float[Array, ""] | float
+    exponent: Float[Array, ""] | float
+    form: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["StribeckFriction"]:
+        return [
+            cls(j, vs, v0, exponent, form)
+            for form in ("whole", "extra", "viscous")
+            for exponent in ((1.0, 2.0) if form != "viscous" else (2.0,))
+            for vs in (0.02, 0.05, 0.1, 0.2, 0.35)
+            for v0 in ((0.004, 0.02) if vs > 0.03 else (0.004,))
+            for j in range(arm.dof)
+        ]
+
+    def variants(self, arm: Arm) -> Sequence[AbstractEffect]:
+        """With bristles, that turn over a distance."""
+        if self.form != "whole":
+            return []
+        return [StribeckBristles(self.joint, self.stribeck_velocity, x, self.exponent) for x in _DISTANCES]
+
+    @property
+    def may_hold(self) -> frozenset[str]:
+        return frozenset({CoulombFriction.name})
+
+    @property
+    def held(self) -> tuple[type[AbstractEffect], ...]:
+        return {"whole": (CoulombFriction,), "viscous": (CoulombFriction, ViscousFriction)}.get(self.form, ())
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        level, excess = Coefficient("coulomb", "N·m", sign=1), Coefficient("static_excess", "N·m", sign=1)
+        slope = Coefficient("damping", "N·m·s/rad", sign=1)
+        return {"whole": (level, excess), "extra": (excess,), "viscous": (level, excess, slope)}[self.form]
+
+    @property
+    def equation(self) -> str:
+        bump = "static_excess * exp(-(|dq| / stribeck_velocity)^exponent)"
+        law = bump if self.form == "extra" else f"(coulomb + {bump})"
+        return f"tau = {law} * tanh(dq / v0)" + (" + damping * dq" if self.form == "viscous" else "")
+
+    def levels(self, s: Channels) -> Float[Array, " n"]:
+        bump = _excess(self, s)
+        one, none = jnp.ones_like(bump), jnp.zeros_like(bump)
+        return jnp.stack({"whole": [one, bump], "extra": [bump], "viscous": [one, bump, none]}[self.form])
+
+    def remainder(self, s: Channels) -> Float[Array, " n"]:
+        qd = s.qd[self.joint]
+        none = jnp.zeros_like(qd)
+        return jnp.stack({"whole": [none, none], "extra": [none], "viscous": [none, none, qd]}[self.form])
+
+
+class StribeckBristles(AbstractMemoryEffect):
+    r"""Stribeck's friction that builds up over a distance after each reversal, as LuGre's does.
+
+    $$\tau_j = \left(F_c + (F_s - F_c)\,e^{-(|\dot q_j|/v_s)^\delta}\right) z, \qquad
+      dz = (\mathrm{sign}(\dot q_j) - z)\,|\dot q_j|\,dt / x_s$$
+
+    LuGre's $\sigma_0 x_s$ is the level at the speed of the moment; here $x_s$ is the same at all speeds, which
+    leaves the law linear in its levels. A search comes to it from `StribeckFriction`.
+
+    References:
+        Canudas de Wit, Olsson, Åström, Lischinsky, IEEE TAC 1995, eqs. 1 to 4.
+    """
+
+    name: ClassVar[str] = StribeckFriction.name
+    shapes: ClassVar[tuple[Shape, ...]] = (_VELOCITY, Shape("breakaway_distance", "rad", 1e-4, 0.05))
+    reveals: ClassVar[str] = StribeckFriction.reveals
+    prior: ClassVar[float] = StribeckFriction.prior
+    confounded_with: ClassVar[tuple[str, ...]] = StribeckFriction.confounded_with
+
+    joint: Joint
+    stribeck_velocity: Float[Array, ""] | float
+    breakaway_distance: Float[Array, ""] | float
+    exponent: Float[Array, ""] | float
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["StribeckBristles"]:
+        return []
+
+    @property
+    def may_hold(self) -> frozenset[str]:
+        return frozenset({CoulombFriction.name})
+
+    @property
+    def held(self) -> tuple[type[AbstractEffect], ...]:
+        return (CoulombFriction,)
+
+    @property
+    def dry(self) -> bool:
+        return True
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return Coefficient("coulomb", "N·m", sign=1), Coefficient("static_excess", "N·m", sign=1)
+
+    @property
+    def equation(self) -> str:
+        return (
+            "tau = (coulomb + static_excess * exp(-(|dq| / stribeck_velocity)^exponent)) * z,"
+            " dz = (sign(dq) - z) * |dq| * dt / breakaway_distance"
+        )
+
+    def start(self, s: Channels) -> Float[Array, " states"]:
+        return turned(s.qd[self.joint])[None]
+
+    def step(
+        self, z: Float[Array, " states"], s: Channels, dt: Seconds
+    ) -> tuple[Float[Array, " states"], Float[Array, " n"]]:
+        z = bristle(z, s.qd[self.joint] * dt / self.breakaway_distance)
+        return z, jnp.concatenate([z, _excess(self, s) * z])
+
+
+def _excess(effect: StribeckFriction | StribeckBristles, s: Channels) -> Float[Array, ""]:
+    """Share of the static excess that is there at a speed."""
+    speed = jnp.abs(s.qd[effect.joint])
+    return jnp.exp(-((speed / effect.stribeck_velocity + 1e-12) ** effect.exponent))
+
+
+EFFECTS = (StribeckFriction, StribeckBristles)
