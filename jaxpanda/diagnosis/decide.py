@@ -12,6 +12,7 @@ from ..effects.friction import CoulombFriction, ViscousFriction
 from ..effects.load import InertialParameters
 from ..effects.memory import PreslidingHysteresis
 from ..effects.sensing import TorqueGain
+from .calibration import SUREST
 from .finding import Finding, joined
 from .problem import Problem, Term
 from .search import posterior
@@ -226,7 +227,7 @@ def _finding(
         joints=joints,
         recordings=tuple(names),
         intervals=intervals,
-        confidence=float(np.clip(own, 0.0, 0.995)),
+        confidence=float(np.clip(own, 0.0, SUREST)),
         alternatives=tuple(alternatives[:4]),
         equation="; ".join(equations),
         parameters=tuple(parameters),

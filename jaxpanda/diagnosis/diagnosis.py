@@ -31,6 +31,7 @@ from ..mjcf import MjcfSource, from_document, from_mjcf
 from ..recordings import Recording, distinct, load
 from ..session import Say, silent
 from . import knowledge as knowledge_
+from .calibration import calibrated
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import Finding, Fit
@@ -237,9 +238,10 @@ def diagnose(
     # numbers that only moved within what they were uncertain by stay as the user wrote them
     written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
+    answer = verdict(found, fitted, partly(problem, state) or not all(_judged(problem)))
     return Diagnosis(
-        verdict=verdict(found, fitted, partly(problem, state) or not all(_judged(problem))),
-        findings=found,
+        verdict=answer,
+        findings=tuple(calibrated(found, answer, fitted.noise_floor)),
         fit=fitted,
         corrected=corrected,
         written=written,

@@ -18,6 +18,7 @@ class Finding:
     recordings: tuple[str, ...]
     intervals: tuple[tuple[float, float], ...] | None
     confidence: float
+    """Probability that it is right."""
     alternatives: tuple[tuple[str, float], ...]
     equation: str
     parameters: tuple[Mapping[str, Any], ...]
@@ -27,6 +28,8 @@ class Finding:
     summary: str
     terms: tuple[int, ...]
     """Which terms of the model it consists of."""
+    posterior: float | None = None
+    """Weight among the models compared, of which `calibration` made the confidence."""
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -35,6 +38,7 @@ class Finding:
             "recordings": list(self.recordings),
             "intervals": None if self.intervals is None else [list(pair) for pair in self.intervals],
             "confidence": self.confidence,
+            "posterior": self.posterior,
             "alternatives": [{"effect": name, "confidence": p} for name, p in self.alternatives],
             "equation": self.equation,
             "parameters": [dict(p) for p in self.parameters],

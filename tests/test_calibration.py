@@ -1,0 +1,68 @@
+"""Confidence: from weights among models to how often such findings are right."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxpanda.diagnosis.calibration import SUREST, calibrated
+from jaxpanda.diagnosis.finding import Finding
+
+NOISE = np.array([0.1, 0.2])
+
+
+def found(rms_torque, confidence=0.9, alternatives=(("armature", 0.08),)):
+    return Finding(
+        effect="viscous_friction",
+        joints=(0,),
+        recordings=("a.csv",),
+        intervals=None,
+        confidence=confidence,
+        alternatives=alternatives,
+        equation="tau = damping * dq",
+        parameters=(),
+        rms_torque=np.array(rms_torque),
+        evidence=10.0,
+        summary="",
+        terms=(0,),
+    )
+
+
+def sure(findings, verdict="explained"):
+    return [f.confidence for f in calibrated(findings, verdict, NOISE)]
+
+
+def test_a_law_that_makes_up_its_joint_is_surer_than_one_that_is_small_beside_it():
+    large, small = sure([found([1.0, 0.0]), found([0.05, 0.0])])
+    assert large > 0.9
+    assert small < large - 0.2
+
+
+def test_nothing_is_as_sure_where_something_stays_unexplained():
+    (explained,), (partly,) = sure([found([1.0, 0.0])]), sure([found([1.0, 0.0])], "partly_explained")
+    assert partly < explained - 0.1
+
+
+def test_the_weight_is_kept_and_probabilities_of_a_place_add_up_to_one_at_most():
+    for weight in (0.0, 0.1, 0.6, SUREST):
+        before = found([1.0, 0.0], weight, (("armature", 1 - weight),))
+        (after,) = calibrated([before], "explained", NOISE)
+        assert after.posterior == weight
+        assert 0 < after.confidence <= SUREST
+        assert after.confidence + sum(p for _, p in after.alternatives) <= 1 + 1e-12
+        unchanged = dataclasses.replace(
+            after, confidence=weight, posterior=None, alternatives=before.alternatives
+        )
+        assert unchanged == before
+
+
+@pytest.mark.parametrize("verdict", ["explained", "partly_explained"])
+def test_more_weight_and_more_torque_never_make_less_sure(verdict):
+    by_weight = [sure([found([1.0, 0.0], w)], verdict)[0] for w in (0.01, 0.3, 0.7, 0.99)]
+    by_torque = [sure([found([x, 0.0])], verdict)[0] for x in (0.01, 0.1, 1.0, 10.0)]
+    assert by_weight == sorted(by_weight)
+    assert by_torque == sorted(by_torque)
+
+
+def test_nothing_found_stays_nothing():
+    assert calibrated([], "consistent", NOISE) == []
