@@ -321,6 +321,7 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Validation": validation,
     "Diagnosis": diagnosis,
     "AtRest": diagnosis,
+    "Misread": diagnosis,
     "Prediction": lambda result: [Section("Prediction", result.lines())],
     "Demonstration": lambda result: result.sections,
 }

@@ -15,7 +15,7 @@ from ..export import missing_assets
 from ..files import output_folder, write_text
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
-from . import page, resting
+from . import meaning, page, resting
 from .diagnosis import Diagnosis, diagnose, predict
 from .host import on_host
 from .knowledge import Knowledge
@@ -49,7 +49,7 @@ def diagnose_files(
     recordings: Sequence[Path],
     reference: Sequence[Path],
     knowledge: Knowledge,
-) -> Diagnosis | resting.AtRest:
+) -> Diagnosis | resting.AtRest | meaning.Misread:
     """`jaxpanda diagnose`."""
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
@@ -67,6 +67,8 @@ def diagnose_files(
         found = dataclasses.replace(found, sources=sources, notes=notes)
         if isinstance(found, resting.AtRest):
             sections = resting.sections(found)
+        elif isinstance(found, meaning.Misread):
+            sections = meaning.sections(found)
         else:
             found = _replayed(found, suspect)
             sections = page.sections(found)
