@@ -39,6 +39,8 @@ _PRIOR = 0.01
 """Prior odds of each kind of reading against the plain one."""
 _CUTOFF = 3.0
 """Of the low-pass on torque and columns [Hz]."""
+_RARE = 0.1
+"""Prior odds, beside the rest of its kind, of a unit that nobody uses and of an arm on the moon."""
 _SAMPLES, _STEP = 100, 0.1
 """Samples of a recording that are compared, at most, and the least time between them [s]."""
 _FEWEST = 30
@@ -79,12 +81,11 @@ _UNITS = {
     "N·mm": 1e3,
     "kN·m": 1e-3,
     "N·cm": 1e2,
-    "kgf·m": 1 / 9.80665,
     "kgf·cm": 100 / 9.80665,
     "lbf·in": 8.850746,
     "ozf·in": 141.6119,
 }
-"""Units that torque is written in, each per N·m; lbf·ft is too near to 1 to be told from a gain."""
+"""Units that torque is written in, each per N·m; lbf·ft is too near to a gain to be told, kgf·m to current."""
 _GEARS = 30.0, 400.0
 """Reduction ratios of arms' gears: a column smaller than torque by so much is torque of the motor's side."""
 
@@ -198,6 +199,7 @@ def _sampled(recording: Recording) -> _Samples | None:
     if len(at) < _FEWEST:
         return None
     q, qd, qdd = (x[keep[at]] for x in (signals.q, signals.qd, signals.qdd))
+    assert signals.tau is not None
     tau = signals.lowpass(signals.tau)[at]
     moving = np.flatnonzero((np.ptp(q, axis=0) > _STILL) & (np.ptp(recording.tau, axis=0) > 0))
     return _Samples(signals.times[at], q, qd, qdd, tau, moving)
@@ -263,7 +265,7 @@ class _Model:
         mass, reach = _LOAD
         payload = np.zeros((10 * self.arm.dof, 10))
         payload[-10:] = np.diag([mass, *3 * [mass * reach], *6 * [mass * reach**2]])
-        return np.concatenate([scipy.linalg.block_diag(*blocks), payload], 1)
+        return np.concatenate([np.asarray(scipy.linalg.block_diag(*blocks)), payload], 1)
 
     def columns(self, j: int) -> Float[np.ndarray, "n p"]:
         """B of joint j."""
@@ -420,6 +422,8 @@ def _scales(model: _Model) -> list[_Reading]:
     logs = np.log(_FACTORS)
     far = np.abs(logs) > np.log(_FAR)
     same = np.arange(dof)
+    if len(moving) < 2:
+        return []
     prior = np.log(_PRIOR) - np.log(far.sum())
     for said, sign in ((plus, 1.0), (minus, -1.0)):
         total = np.where(far, said[moving].sum(0), -np.inf)
@@ -430,6 +434,8 @@ def _scales(model: _Model) -> list[_Reading]:
         usual = abs(np.log(known / common)) < np.log(1.3)
         if usual:
             score += np.log(far.sum() / 5)  # one of few usual units, not any number
+        else:
+            score += np.log(_RARE)
         common = known if usual else common
         kind = "motor_side" if not usual and 1 / _GEARS[1] < common < 1 / _GEARS[0] else "unit"
         out.append(_Reading(kind, score, np.full(dof, sign * common), same))
@@ -535,6 +541,8 @@ def _mountings(model: _Model) -> list[_Reading]:
         return []
     if _angle(g, model.gravity) < _TOLD and 0.5 * expected < np.linalg.norm(g) < 2 * expected:
         return []
+    if np.linalg.norm(g) < 0.5 * expected:
+        score += np.log(_RARE)
     return [_Reading("mounting", score, np.ones(dof), np.arange(dof), gravity=g)]
 
 
