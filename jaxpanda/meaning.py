@@ -159,10 +159,10 @@ def meaning(recording: Recording, arm: Arm) -> Meaning | None:
         recording: with torque.
         arm: of the same robot.
 
-    None as well where nothing can be told: no torque, too short a recording, an arm at rest.
+    None as well where nothing can be told: no torque, too short a recording, fewer than two joints that move.
     """
     samples = _sampled(recording)
-    if samples is None or not len(samples.moving):
+    if samples is None or len(samples.moving) < 2:
         return None
     model = _Model(arm, samples, np.arange(arm.dof))
     readings = _readings(model)
@@ -422,8 +422,6 @@ def _scales(model: _Model) -> list[_Reading]:
     logs = np.log(_FACTORS)
     far = np.abs(logs) > np.log(_FAR)
     same = np.arange(dof)
-    if len(moving) < 2:
-        return []
     prior = np.log(_PRIOR) - np.log(far.sum())
     for said, sign in ((plus, 1.0), (minus, -1.0)):
         total = np.where(far, said[moving].sum(0), -np.inf)
