@@ -18,7 +18,7 @@ from ..files import output_folder, write_text
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
 from ..session import telling
-from . import page, resting
+from . import meaning, page, resting
 from .diagnosis import Diagnosis, diagnose, predict
 from .host import on_host
 from .knowledge import Knowledge
@@ -59,7 +59,7 @@ def diagnose_files(
     recordings: Sequence[Path],
     reference: Sequence[Path],
     knowledge: Knowledge,
-) -> Diagnosis | resting.AtRest:
+) -> Diagnosis | resting.AtRest | meaning.Misread:
     """`jaxpanda diagnose`."""
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
@@ -81,6 +81,8 @@ def diagnose_files(
         found = dataclasses.replace(found, sources=sources, notes=notes)
         if isinstance(found, resting.AtRest):
             sections = resting.sections(found)
+        elif isinstance(found, meaning.Misread):
+            sections = meaning.sections(found)
         else:
             say("simulating both arms along a recording")
             found = _replayed(found, suspect)

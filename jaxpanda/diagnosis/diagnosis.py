@@ -36,6 +36,7 @@ from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import Finding, Fit
 from .host import on_host
 from .localise import Localisation, localise, unbiased
+from .meaning import Misread, misread
 from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
@@ -177,8 +178,9 @@ def diagnose(
     reference: Sequence[str | Path | Recording] = (),
     knowledge: knowledge_.Knowledge = "identified",
     progress: Say = silent,
-) -> Diagnosis | AtRest:
-    """Say which physics a simulation is missing; of an arm that holds still, what friction at rest leaves open.
+) -> Diagnosis | AtRest | Misread:
+    """Say which physics a simulation is missing; of an arm that holds still, what friction at rest leaves open;
+    of torque that is not what inverse dynamics gives, what it is.
 
     Args:
         model: the simulation (MJCF) as the user has it; None for the project's own Panda.
@@ -211,6 +213,10 @@ def diagnose(
         return judge(suspect, healthy, source, knowledge)
     for recording in loaded:
         _require_live_torque(recording)
+    in_question = [one for one, on in zip(distinct(loaded), active, strict=True) if on]
+    wrongly_read = misread(in_question, suspect, source, knowledge)
+    if wrongly_read is not None:
+        return wrongly_read
     progress("looking for effects that make the recordings likelier; that takes most of the time")
     log = _Log(progress)
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)
