@@ -25,6 +25,7 @@ import scipy.optimize
 import scipy.special
 from jaxpanda_kernels import regressor
 from jaxtyping import Float, Int
+from threadpoolctl import threadpool_limits
 
 from .arm import Arm
 from .recordings import Recording
@@ -43,6 +44,10 @@ _RARE = 0.1
 """Prior odds, beside the rest of its kind, of a unit that nobody uses and of an arm on the moon."""
 _SAMPLES, _STEP = 100, 0.1
 """Samples of a recording that are compared, at most, and the least time between them [s]."""
+_MOST = _SAMPLES + 2
+"""Samples that the regressor is compiled for."""
+_COARSE = 3
+"""One sample of so many is compared first where all channels may be out of order: orders are many."""
 _FEWEST = 30
 """Samples from which a recording is judged."""
 _STILL = 0.02
@@ -151,6 +156,22 @@ class _Samples:
     moving: Int[np.ndarray, " moving"]
     """Joints that move."""
 
+    @functools.cached_property
+    def errors(self) -> list[tuple[Float[np.ndarray, "n n"], float]]:
+        """For each correlation time of the error: what turns it into white noise, and the logarithm of its
+        correlation's determinant."""
+        apart, out = np.abs(self.time[:, None] - self.time), []
+        for memory in _MEMORIES:
+            L = np.linalg.cholesky((1 - _WHITE) * np.exp(-apart / memory) + _WHITE * np.eye(len(apart)))
+            white = scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True)
+            out.append((white, float(2 * np.sum(np.log(np.diag(L))))))
+        return out
+
+    def every(self, step: int) -> "_Samples":
+        """One sample of `step`."""
+        parts = (self.time, self.q, self.qd, self.qdd, self.tau)
+        return _Samples(*(x[::step] for x in parts), self.moving)
+
 
 def meaning(recording: Recording, arm: Arm) -> Meaning | None:
     """What the torque column is, where that is not the joint torque of this arm with near certainty; else None.
@@ -165,7 +186,8 @@ def meaning(recording: Recording, arm: Arm) -> Meaning | None:
     if samples is None or len(samples.moving) < 2:
         return None
     model = _Model(arm, samples, np.arange(arm.dof))
-    readings = _readings(model)
+    with threadpool_limits(limits=1, user_api="blas"):  # for small matrices several cost more than they save
+        readings = _readings(model)
     plain = readings[0]
     scores = np.array([r.score for r in readings])
     best = readings[int(np.argmax(scores))]
@@ -222,16 +244,15 @@ class _Model:
     @functools.cached_property
     def parts(self) -> tuple[Float[np.ndarray, "n dof standard"], Float[np.ndarray, "3 n dof standard"]]:
         """Regressor without gravity, and that of a unit of gravity along each axis."""
-        rest = np.zeros_like(self.q)
-        shape = (*self.q.shape, -1)
-        none = self._regressor(np.zeros(3), self.q, self.qd, self.qdd)
-        axes = [self._regressor(axis, self.q, rest, rest) for axis in np.eye(3)]
-        return none.reshape(shape), np.stack([a.reshape(shape) for a in axes])
-
-    def _regressor(self, gravity: np.ndarray, *motion: np.ndarray) -> np.ndarray:
-        """Of all samples; padded to one number of them, so that it is compiled once."""
-        padded = [np.pad(x, ((0, max(0, _SAMPLES + 2 - len(x))), (0, 0))) for x in motion]
-        return np.asarray(_regressors(self.arm.chain, gravity, *padded))[: len(self.q)]
+        n, dof = self.q.shape
+        still = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+        gravity = np.repeat(still, _MOST, axis=0)
+        q, qd, qdd = (np.pad(x, ((0, _MOST - n), (0, 0))) for x in (self.q, self.qd, self.qdd))
+        at_rest = np.zeros((3 * _MOST, dof))
+        motion = np.tile(q, (4, 1)), np.concatenate([qd, at_rest]), np.concatenate([qdd, at_rest])
+        Y = np.asarray(_regressors(self.arm.chain, gravity, *motion))
+        Y = Y.reshape(4, _MOST, dof, -1)[:, :n]
+        return Y[0], Y[1:]
 
     @functools.cached_property
     def inertial(self) -> Float[np.ndarray, "n dof"]:
@@ -296,17 +317,13 @@ class _Model:
     def bases(self, j: int) -> list[tuple[np.ndarray, np.ndarray, float]]:
         """For each correlation time of the error: what turns samples into independent ones, their variances by
         B, and the logarithm of the determinant."""
-        apart = np.abs(self.samples.time[:, None] - self.samples.time)
         if j in self._bases:
             return self._bases[j]
         B, out = self.columns(j), []
-        for memory in _MEMORIES:
-            R = (1 - _WHITE) * np.exp(-apart / memory) + _WHITE * np.eye(len(apart))
-            L = np.linalg.cholesky(R)
-            white = scipy.linalg.solve_triangular(L, np.column_stack([B, np.eye(len(L))]), lower=True)
-            variances, U = np.linalg.eigh(white[:, : B.shape[1]] @ white[:, : B.shape[1]].T)
-            turned = U.T @ white[:, B.shape[1] :]
-            out.append((turned, np.maximum(variances, 0.0), float(2 * np.sum(np.log(np.diag(L))))))
+        for white, determinant in self.samples.errors:
+            X = white @ B
+            variances, U = np.linalg.eigh(X @ X.T)
+            out.append((U.T @ white, np.maximum(variances, 0.0), determinant))
         self._bases[j] = out
         return out
 
@@ -361,8 +378,9 @@ class _Model:
 
 
 _regressors = jax.jit(
-    lambda chain, gravity, q, qd, qdd: jax.vmap(regressor, in_axes=(None, 0, 0, 0))(
-        dataclasses.replace(chain, gravity=gravity), q, qd, qdd
+    jax.vmap(
+        lambda chain, gravity, q, qd, qdd: regressor(dataclasses.replace(chain, gravity=gravity), q, qd, qdd),
+        in_axes=(None, 0, 0, 0, 0),
     )
 )
 
@@ -484,13 +502,13 @@ def _orders(model: _Model, plain: float) -> list[_Reading]:
         score = _order_prior(order) + float(said[np.arange(dof), order].sum())
         out.append(_Reading("joint_order", score, np.ones(dof), order))
     best, score = np.arange(dof), plain
-    tried = {tuple(best)}
+    tried, coarse = {tuple(best)}, model.samples.every(_COARSE)
     for _ in range(3):  # swaps, one upon the other, from the order that is best so far
         swaps = [_swapped(best, i, k) for i in range(dof) for k in range(i)]
         fresh = [o for o in (*swaps, best[::-1].copy()) if tuple(o) not in tried]
         tried |= {tuple(o) for o in fresh}
-        rated = [(_whole(model, o), o) for o in fresh]
-        top, order = max(rated, key=lambda pair: pair[0])
+        order = max(fresh, key=lambda o: _Model(model.arm, coarse, o).evidence())
+        top = _Model(model.arm, model.samples, order).evidence()
         if top < score + _NEEDS:
             break
         best, score = order, top
@@ -498,11 +516,6 @@ def _orders(model: _Model, plain: float) -> list[_Reading]:
         total = _order_prior(best) + score
         out.append(_Reading("joint_order", total, np.ones(dof), best, whole_order=True))
     return out
-
-
-def _whole(model: _Model, order: Int[np.ndarray, " dof"]) -> float:
-    """Evidence where all channels are in this order."""
-    return _Model(model.arm, model.samples, order).evidence()
 
 
 def _swapped(order: Int[np.ndarray, " dof"], i: int, k: int) -> Int[np.ndarray, " dof"]:
@@ -525,16 +538,18 @@ def _order_prior(order: Int[np.ndarray, " dof"]) -> float:
 def _mountings(model: _Model) -> list[_Reading]:
     r"""Gravity fitted freely, $g \sim N(0, 9.81^2)$, with links' errors turned along; by Laplace's method."""
     size, dof = 9.81, model.arm.dof
+    expected = max(float(np.linalg.norm(model.gravity)), 1e-9)
     current, score, g = model, -np.inf, model.gravity
     for _ in range(3):
         H, h = np.eye(3) / size**2, np.zeros(3)
         for j in model.moving:
             H, h = _informed(current, j, H, h)
         g = np.linalg.solve(H, h)
+        if _angle(g, model.gravity) < 0.5 * _TOLD and 0.7 < np.linalg.norm(g) / expected < 1.4:
+            return []  # no other mounting
         current = _Model(model.arm, model.samples, model.order, g)
         occam = -0.5 * float(np.linalg.slogdet(H * size**2)[1]) - 0.5 * float(g @ g) / size**2
         score = np.log(_PRIOR) + current.evidence() + occam
-    expected = float(np.linalg.norm(model.gravity))
     if np.linalg.norm(g) < _LIGHTEST:
         return []
     if _angle(g, model.gravity) < _TOLD and 0.5 * expected < np.linalg.norm(g) < 2 * expected:
@@ -547,19 +562,17 @@ def _mountings(model: _Model) -> list[_Reading]:
 def _informed(model: _Model, j: int, H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What joint j tells of gravity, by its likeliest error."""
     G, r = model.weight[:, j], model.tau[:, j] - model.inertial[:, j]
-    best: tuple[float, np.ndarray, np.ndarray] | None = None
+    said, found = [], []
     for turned, variances, determinant in model.bases(j):
         A, y = turned @ G, turned @ r
-        for total in _totals(variances, model.size[j]).T:
-            w = 1 / total
-            HA, hA = (A.T * w) @ A, (A.T * w) @ y
-            K = HA + np.eye(3) / 9.81**2
-            said = 0.5 * float(hA @ np.linalg.solve(K, hA) - np.sum(w * y * y) + np.sum(np.log(w)))
-            said -= 0.5 * (determinant + float(np.linalg.slogdet(K)[1]))
-            if best is None or said > best[0]:
-                best = said, HA, hA
-    assert best is not None
-    return H + best[1], h + best[2]
+        w = 1 / _totals(variances, model.size[j])
+        HA, hA = np.einsum("na,nb,nh->hab", A, A, w), np.einsum("na,n,nh->ha", A, y, w)
+        K = HA + np.eye(3) / 9.81**2
+        fit = np.einsum("ha,ha->h", hA, np.linalg.solve(K, hA[..., None])[..., 0])
+        said.append(0.5 * (fit - y**2 @ w + np.sum(np.log(w), 0) - determinant - np.linalg.slogdet(K)[1]))
+        found.append((HA, hA))
+    memory, error = np.unravel_index(np.argmax(said), np.shape(said))
+    return H + found[memory][0][error], h + found[memory][1][error]
 
 
 def _angle(g: np.ndarray, other: np.ndarray) -> float:
