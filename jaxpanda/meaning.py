@@ -28,6 +28,7 @@ from jaxtyping import Float, Int
 from threadpoolctl import threadpool_limits
 
 from .arm import Arm
+from .convention import REMOVED, UNITS
 from .recordings import Recording
 from .signals import prepare
 
@@ -54,8 +55,8 @@ _STILL = 0.02
 """Travel below which a joint is not judged [rad]: friction at rest may carry its load."""
 _MEMORIES = np.array([0.05, 0.2, 0.8])
 """Correlation times of the error [s]."""
-_SIZES = np.exp(np.arange(np.log(2e-3), np.log(2e4), 0.5))
-"""Sizes of the error, in the size of the joint's torque."""
+_SIZES = np.exp(np.arange(np.log(1e-6), np.log(2e4), 0.5))
+"""Sizes of the error, in the size of the joint's torque: smaller ones than any, lest a factor stand in for them."""
 _SHARES = np.array([0.03, 0.1, 0.3, 1.0])
 """Shares of the deviations below that a joint may have: most models are better than the worst."""
 _WHITE = 0.03
@@ -82,14 +83,7 @@ _TOLD = 10.0
 """Angle from the model's gravity beyond which a mounting is told [degrees]."""
 _LIGHTEST = 0.8
 """Gravity below which it is taken for removed [m/s²]: the moon's is 1.6."""
-_UNITS = {
-    "N·mm": 1e3,
-    "kN·m": 1e-3,
-    "N·cm": 1e2,
-    "kgf·cm": 100 / 9.80665,
-    "lbf·in": 8.850746,
-    "ozf·in": 141.6119,
-}
+_UNITS = {name: 1 / size for name, size in UNITS.items() if name not in ("Nm", "lbfft", "kgfm", "Nmm")}
 """Units that torque is written in, each per N·m; lbf·ft is too near to a gain to be told, kgf·m to current."""
 _GEARS = 30.0, 400.0
 """Reduction ratios of arms' gears: a column smaller than torque by so much is torque of the motor's side."""
@@ -119,8 +113,10 @@ class Meaning:
     """By how much the column differs from the torque it stands for, at each joint."""
     says: str
     """What the column is, in a sentence."""
+    options: str
+    """Of the commands that read recordings: by which this one is read as it is meant."""
     mend: str
-    """What to change in the file, or in the model."""
+    """The same in a sentence, with what else would do."""
 
     @property
     def summary(self) -> str:
@@ -169,8 +165,8 @@ class _Samples:
 
     def every(self, step: int) -> "_Samples":
         """One sample of `step`."""
-        parts = (self.time, self.q, self.qd, self.qdd, self.tau)
-        return _Samples(*(x[::step] for x in parts), self.moving)
+        time, q, qd, qdd, tau = (x[::step] for x in (self.time, self.q, self.qd, self.qdd, self.tau))
+        return _Samples(time, q, qd, qdd, tau, self.moving)
 
 
 def meaning(recording: Recording, arm: Arm) -> Meaning | None:
@@ -223,7 +219,8 @@ def _sampled(recording: Recording) -> _Samples | None:
     q, qd, qdd = (x[keep[at]] for x in (signals.q, signals.qd, signals.qdd))
     assert signals.tau is not None
     tau = signals.lowpass(signals.tau)[at]
-    moving = np.flatnonzero((np.ptp(q, axis=0) > _STILL) & (np.ptp(recording.tau, axis=0) > 0))
+    spread = np.ptp(recording.tau, axis=0)
+    moving = np.flatnonzero((np.ptp(q, axis=0) > _STILL) & (spread > 1e-6 * spread.max()))
     return _Samples(signals.times[at], q, qd, qdd, tau, moving)
 
 
@@ -590,7 +587,7 @@ def _told(best: _Reading, model: _Model, confidence: float, gain: float) -> Mean
         "joint_order": np.flatnonzero(best.order != np.arange(dof)),
     }.get(best.kind, np.arange(dof))
     rms = np.sqrt(np.mean((model.samples.tau - model.torque) ** 2, 0))
-    says, mend = _words(best, model, joints)
+    says, options, mend = _words(best, model, joints)
     return Meaning(
         kind=best.kind,
         joints=tuple(int(j) for j in joints),
@@ -602,59 +599,85 @@ def _told(best: _Reading, model: _Model, confidence: float, gain: float) -> Mean
         gravity=None if best.gravity is None else tuple(map(float, best.gravity)),  # pyright: ignore
         rms=tuple(float(v) for v in rms),
         says=says,
+        options=options,
         mend=mend,
     )
 
 
-def _words(best: _Reading, model: _Model, joints: np.ndarray) -> tuple[str, str]:
-    """What the column is, and what mends it."""
+def _words(best: _Reading, model: _Model, joints: np.ndarray) -> tuple[str, str, str]:
+    """What the column is, the options that read it so, and what mends it."""
     dof = model.arm.dof
     named = f"joint{'s' * (len(joints) > 1)} {', '.join(str(j + 1) for j in joints)}"
-    signs = " ".join("-1" if k < 0 else "1" for k in best.factors)
     if best.kind == "gravity_removed":
+        options = f"--gravity {REMOVED}"
         return (
             "The torque column holds no gravity: it agrees with the model's inertia and friction alone.",
-            "Add gravity to columns tau_1 … in the file, or record torque with gravity in it.",
+            options,
+            f"Give `{options}`, which adds the model's; or record torque with gravity in it.",
         )
     if best.kind == "sign":
         where = "of all joints" if len(joints) == dof else f"of {named}"
+        options = _sign_option(best.factors)
         return (
             f"The torque column {where} has the wrong sign: positive is along the joint axis.",
-            f"Multiply columns tau_1 … in the file by {signs}.",
+            options,
+            f"Give `{options}`.",
         )
     if best.kind in ("unit", "current", "motor_side"):
-        listed = " ".join(f"{abs(k):.3g}" for k in best.factors)
-        reverse = f", and multiply them by {signs}" if np.any(best.factors < 0) else ""
-        k = abs(float(best.factors[joints[0]]))
-        if best.kind == "unit" and len(joints) == dof:
-            unit = next((u for u, size in _UNITS.items() if size == k), "")
-            says = f"The torque column is {k:.3g} times the joint torque" + (f": {unit}." if unit else ".")
-            return says, f"Divide columns tau_1 … in the file by {k:.3g}{reverse}."
-        if best.kind == "unit":
-            says = f"The torque column of {named} is in another unit: {listed} times the joint torque."
-        elif best.kind == "current":
-            says = f"The torque column is like motor current, with a constant a joint: {listed} A/(N·m)."
-        else:
-            says = (
-                f"The torque column is like torque on the motors' side of the gears: {listed} of the joint's."
-            )
-        return (
-            says,
-            f"Divide columns tau_1 … by the drives' own constants; as the model has it, about {listed}{reverse}.",
-        )
+        return _scale_words(best, joints, named)
     if best.kind == "joint_order":
         order = " ".join(str(j + 1) for j in best.order)
         what = "All columns" if best.whole_order else "The torque columns"
-        says = f"{what} are out of order: they are those of joints {order}."
-        if best.whole_order:
-            return says, f"Rename columns _1 … _{dof} of q, dq and tau in the file to {order}."
-        return says, f"Rename the columns tau_1 … tau_{dof} in the file to {order}."
+        options = f"--joint-order {'' if best.whole_order else 'tau '}{order}"
+        return f"{what} are out of order: they are those of joints {order}.", options, f"Give `{options}`."
     assert best.gravity is not None
     g = best.gravity
+    size, expected = float(np.linalg.norm(g)), float(np.linalg.norm(model.gravity))
+    if 0.8 < size / max(expected, 1e-9) < 1.25:
+        g = g * expected / size  # its direction is what was found
+    x, y, z = (f"{v + 0.0:.3g}" if abs(v) > 1e-3 * size else "0" for v in g)
+    options = f"--gravity {x} {y} {z}"
     return (
-        f"The arm is mounted otherwise than the model: {_mounted(g, model.gravity)}.",
-        f'Set gravity="{g[0]:.3g} {g[1]:.3g} {g[2]:.3g}" in the model\'s <option>.',
+        f"The arm is mounted otherwise than the model: {_mounted(best.gravity, model.gravity)}.",
+        options,
+        f'Give `{options}`, or set gravity="{x} {y} {z}" in the model\'s <option>.',
     )
+
+
+def _scale_words(best: _Reading, joints: np.ndarray, named: str) -> tuple[str, str, str]:
+    """`_words` of a column in another unit, or of current."""
+    every = len(joints) == len(best.factors)
+    sizes = np.abs(best.factors)
+    listed = " ".join(f"{k:.3g}" for k in sizes)
+    worth = " ".join(f"{1 / k:.3g}" for k in sizes)
+    reverse = f" {_sign_option(best.factors)}" if np.any(best.factors < 0) else ""
+    if best.kind == "unit":
+        if not every:
+            options = f"--torque-unit {worth}{reverse}"
+            says = f"The torque column of {named} is in another unit: {listed} times the joint torque."
+            return says, options, f"Give `{options}`."
+        k = float(sizes[0])
+        unit = next((name for name, size in _UNITS.items() if size == k), "")
+        options = f"--torque-unit {unit or f'{1 / k:.3g}'}{reverse}"
+        says = f"The torque column is {k:.3g} times the joint torque" + (f": {unit}." if unit else ".")
+        return says, options, f"Give `{options}`."
+    options = f"--torque-unit {worth}{reverse}"
+    says = (
+        f"The torque column is like motor current, with a constant a joint: {listed} A/(N·m)."
+        if best.kind == "current"
+        else f"The torque column is like torque on the motors' side of the gears: {listed} of the joint's."
+    )
+    return (
+        says,
+        options,
+        f"Give the drives' own constants, N·m per unit of the column; as the model has it, about `{options}`.",
+    )
+
+
+def _sign_option(factors: np.ndarray) -> str:
+    """`--torque-sign` for factors of these signs."""
+    signs = ["-" if k < 0 else "+" for k in factors]
+    return f"--torque-sign {' '.join(signs) if '+' in signs else '-'}"
 
 
 def _mounted(g: np.ndarray, model: np.ndarray) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import report
+from ..convention import PLAIN, Convention
 from ..corrected import XML, read
 from ..errors import InputError
 from ..export import missing_assets
@@ -59,6 +60,7 @@ def diagnose_files(
     recordings: Sequence[Path],
     reference: Sequence[Path],
     knowledge: Knowledge,
+    convention: Convention = PLAIN,
 ) -> Diagnosis | resting.AtRest | meaning.Misread:
     """`jaxpanda diagnose`."""
     if not recordings:
@@ -66,11 +68,16 @@ def diagnose_files(
     with output_folder(out) as folder, telling("diagnosing") as say:
         count = len(recordings) + len(reference)
         say(f"reading {count} recording{'s' * (count != 1)}")
-        suspect, healthy = load_many(recordings), load_many(reference)
+        suspect, healthy = (convention.applied(load_many(ps), model) for ps in (recordings, reference))
         every = distinct([*suspect, *healthy])
         suspect, healthy = every[: len(suspect)], every[len(suspect) :]
         found = diagnose(
-            model, suspect, reference=healthy, knowledge=knowledge, progress=lambda line: say(plainly(line))
+            model,
+            suspect,
+            reference=healthy,
+            knowledge=knowledge,
+            gravity=convention.mounting,
+            progress=lambda line: say(plainly(line)),
         )
         given = [("model", p) for p in [model] if p]
         given += [("recording", p) for p in recordings] + [("reference", p) for p in reference]

@@ -27,7 +27,7 @@ from ..export import (
     write_parameters,
 )
 from ..feasible.nearest import are_buildable, nearest_buildable
-from ..mjcf import MjcfSource, from_document, from_mjcf
+from ..mjcf import MjcfSource, from_document, from_mjcf, with_gravity
 from ..recordings import Recording, distinct, load
 from ..session import Say, silent
 from . import knowledge as knowledge_
@@ -177,6 +177,7 @@ def diagnose(
     *,
     reference: Sequence[str | Path | Recording] = (),
     knowledge: knowledge_.Knowledge = "identified",
+    gravity: Sequence[float] | None = None,
     progress: Say = silent,
 ) -> Diagnosis | AtRest | Misread:
     """Say which physics a simulation is missing; of an arm that holds still, what friction at rest leaves open;
@@ -187,6 +188,7 @@ def diagnose(
         recordings: of the arm, with torque.
         reference: recordings of the same arm from when nothing was wrong; what they show is not reported.
         knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` explains the words.
+        gravity: in place of the model's, in the frame of its world [m/s²].
         progress: called with what is being done, and with each line of `log` as it is written.
 
     Raises:
@@ -195,9 +197,10 @@ def diagnose(
     require_x64("a diagnosis")
     knowledge_.check(knowledge)
     if model is None:
-        arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", Path("panda.xml")))
+        own = markup.parse(panda_mjcf(), "mujoco", Path("panda.xml"))
+        arm, source = from_document(with_gravity(own, gravity))
     else:
-        arm, source = from_mjcf(model)
+        arm, source = from_mjcf(model, gravity)
     if not recordings:
         raise InputError("no recording: a diagnosis needs at least one")
     loaded = [one if isinstance(one, Recording) else load(one) for one in (*recordings, *reference)]
