@@ -56,7 +56,7 @@ _STILL = 0.02
 _MEMORIES = np.array([0.05, 0.2, 0.8])
 """Correlation times of the error [s]."""
 _SIZES = np.exp(np.arange(np.log(1e-6), np.log(2e4), 0.5))
-"""Sizes of the error, in the size of the joint's torque: smaller ones than any, lest a factor stand in for them."""
+"""Sizes of the error, in the size of the joint's torque; the least are none, lest a factor stand in for them."""
 _SHARES = np.array([0.03, 0.1, 0.3, 1.0])
 """Shares of the deviations below that a joint may have: most models are better than the worst."""
 _WHITE = 0.03
@@ -77,6 +77,8 @@ _FACTORS = np.exp(np.arange(-9.6, 9.7, 0.1))
 """Factors between a column and the torque that are tried."""
 _FAR = 3.0
 """A constant within this factor of 1 is a gain, not a unit."""
+_NEAR = 1.3
+"""A constant within this factor of a usual unit is taken for it."""
 _OWN = 0.6
 """Deviation of the logarithm of motors' constants about their common one."""
 _TOLD = 10.0
@@ -213,7 +215,8 @@ def _sampled(recording: Recording) -> _Samples | None:
     signals = prepare(recording, cutoff=cutoff, derivative_cutoff=2 * cutoff, trim=min(0.6, duration / 10))
     keep = signals.keep
     step = max(_STEP, float(signals.times[-1] - signals.times[0]) / _SAMPLES)
-    at = np.unique(np.searchsorted(signals.times, np.arange(signals.times[0], signals.times[-1], step)))
+    at = np.searchsorted(signals.times, np.arange(signals.times[0], signals.times[-1], step))
+    at = np.unique(np.minimum(at, len(signals.times) - 1))
     if len(at) < _FEWEST:
         return None
     q, qd, qdd = (x[keep[at]] for x in (signals.q, signals.qd, signals.qdd))
@@ -252,13 +255,17 @@ class _Model:
         return Y[0], Y[1:]
 
     @functools.cached_property
-    def inertial(self) -> Float[np.ndarray, "n dof"]:
-        """Torque without gravity and friction [N m]."""
+    def known(self) -> Float[np.ndarray, "n dof"]:
+        """Torque of rotors, springs and friction that the model holds [N m]."""
         arm = self.arm
         known = np.asarray(arm.armature) * self.qdd + np.asarray(arm.damping) * self.qd
         known = known + np.asarray(arm.stiffness) * (self.q - np.asarray(arm.springref))
-        loss = np.asarray(arm.frictionloss) * np.tanh(self.qd / 0.02)
-        return self.parts[0] @ np.asarray(arm.standard).ravel() + known + loss
+        return known + np.asarray(arm.frictionloss) * np.tanh(self.qd / 0.02)
+
+    @functools.cached_property
+    def inertial(self) -> Float[np.ndarray, "n dof"]:
+        """Torque without gravity [N m]."""
+        return self.parts[0] @ np.asarray(self.arm.standard).ravel() + self.known
 
     @functools.cached_property
     def weight(self) -> Float[np.ndarray, "n dof 3"]:
@@ -327,14 +334,19 @@ class _Model:
     def joint_evidence(
         self, j: int, column: Float[np.ndarray, " n"], mean: Float[np.ndarray, " n"], factors: np.ndarray
     ) -> Float[np.ndarray, " factors"]:
-        """Logarithm of the probability of a column, were it each factor times joint j's torque [nats]."""
+        """Logarithm of the probability of a column, were it each factor times joint j's torque [nats].
+
+        What the model holds beyond its links may be a stand-in for nothing: it is there or not, alike likely.
+        """
+        means = [mean, mean - self.known[:, j]] if np.any(self.known[:, j]) else [mean]
         said = []
         for turned, variances, determinant in self.bases(j):
-            y, m = turned @ column, turned @ mean
-            total = _totals(variances, self.size[j])
-            yy, ym, mm = ((u * v) @ (1 / total) for u, v in ((y, y), (y, m), (m, m)))
-            square = yy[:, None] / factors**2 - 2 * ym[:, None] / factors + mm[:, None]
-            said.append(-0.5 * (square + np.sum(np.log(total), 0)[:, None] + determinant))
+            w = 1 / _totals(variances, self.size[j])
+            y = turned @ column
+            yy, constant = y**2 @ w, determinant - np.sum(np.log(w), 0)
+            for m in (turned @ each for each in means):
+                square = yy[:, None] / factors**2 - 2 * ((y * m) @ w)[:, None] / factors
+                said.append(-0.5 * (square + (m**2 @ w + constant)[:, None]))
         said = np.concatenate(said)
         n = len(column)
         return (
@@ -436,6 +448,8 @@ def _scales(model: _Model) -> list[_Reading]:
     plus, minus = model.by_factor
     logs = np.log(_FACTORS)
     far = np.abs(logs) > np.log(_FAR)
+    units = np.log(list(_UNITS.values()))
+    usual = far & (np.abs(logs[:, None] - units).min(1) < np.log(_NEAR))
     same = np.arange(dof)
     prior = np.log(_PRIOR) - np.log(far.sum())
     for said, sign in ((plus, 1.0), (minus, -1.0)):
@@ -444,13 +458,12 @@ def _scales(model: _Model) -> list[_Reading]:
         score = prior + float(scipy.special.logsumexp(total))
         common = float(np.exp(logs[k]))
         known = min(_UNITS.values(), key=lambda unit: abs(np.log(unit / common)))
-        usual = abs(np.log(known / common)) < np.log(1.3)
-        if usual:
+        if usual[k]:
             score += np.log(far.sum() / 5)  # one of few usual units, not any number
         else:
             score += np.log(_RARE)
-        common = known if usual else common
-        kind = "motor_side" if not usual and 1 / _GEARS[1] < common < 1 / _GEARS[0] else "unit"
+        common = known if usual[k] else common
+        kind = "motor_side" if not usual[k] and 1 / _GEARS[1] < common < 1 / _GEARS[0] else "unit"
         out.append(_Reading(kind, score, np.full(dof, sign * common), same))
         # a motor's constant a joint, none near 1: each about a common one, of which all are equally likely
         apart = np.where(far, -0.5 * ((logs[:, None] - logs) / _OWN) ** 2, -np.inf)
@@ -469,10 +482,11 @@ def _scales(model: _Model) -> list[_Reading]:
     one = int(np.argmin(np.abs(logs)))
     factors, score, count = np.ones(dof), np.log(_PRIOR), 0
     for j in moving:
-        alone = np.where(far, plus[j], -np.inf)
-        gain = scipy.special.logsumexp(alone) - plus[j, one] - np.log(dof * far.sum())
+        alone = np.where(usual, plus[j], -np.inf)  # any number is likelier to be something else at that joint
+        gain = scipy.special.logsumexp(alone) - plus[j, one] - np.log(dof * usual.sum())
         if gain > 0:
-            factors[j], count = float(np.exp(logs[np.argmax(alone)])), count + 1
+            k = float(np.exp(logs[np.argmax(alone)]))
+            factors[j], count = min(_UNITS.values(), key=lambda unit: abs(np.log(unit / k))), count + 1
         score += plus[j, one] + max(gain, 0.0)
     if 0 < count < len(moving):
         out.append(_Reading("unit", float(score), factors, same))
