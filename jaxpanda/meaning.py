@@ -16,6 +16,7 @@ the plain one is next to none (`SURE`); its own posterior is its confidence.
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -190,10 +191,10 @@ def meaning(recording: Recording, arm: Arm) -> Meaning | None:
     scores = np.array([r.score for r in readings])
     best = readings[int(np.argmax(scores))]
     kinds = np.array([r.kind for r in readings])
-    alike = scipy.special.logsumexp(scores[kinds == best.kind])
-    confidence = float(np.exp(alike - scipy.special.logsumexp(scores)))
+    alike = _logsumexp(scores[kinds == best.kind])
+    confidence = float(np.exp(alike - _logsumexp(scores)))
     gain = best.score - plain.score
-    unlikely = plain.score - scipy.special.logsumexp(scores)
+    unlikely = plain.score - _logsumexp(scores)
     if not best.kind or unlikely > np.log(1 - SURE) or confidence < 0.5 or gain < _NEEDS:
         return None
     return _told(best, model, min(confidence, 0.995), float(gain))
@@ -244,15 +245,8 @@ class _Model:
     @functools.cached_property
     def parts(self) -> tuple[Float[np.ndarray, "n dof standard"], Float[np.ndarray, "3 n dof standard"]]:
         """Regressor without gravity, and that of a unit of gravity along each axis."""
-        n, dof = self.q.shape
-        still = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-        gravity = np.repeat(still, _MOST, axis=0)
-        q, qd, qdd = (np.pad(x, ((0, _MOST - n), (0, 0))) for x in (self.q, self.qd, self.qdd))
-        at_rest = np.zeros((3 * _MOST, dof))
-        motion = np.tile(q, (4, 1)), np.concatenate([qd, at_rest]), np.concatenate([qdd, at_rest])
-        Y = np.asarray(_regressors(self.arm.chain, gravity, *motion))
-        Y = Y.reshape(4, _MOST, dof, -1)[:, :n]
-        return Y[0], Y[1:]
+        (parts,) = _parts([self])
+        return parts
 
     @functools.cached_property
     def known(self) -> Float[np.ndarray, "n dof"]:
@@ -350,7 +344,7 @@ class _Model:
         said = np.concatenate(said)
         n = len(column)
         return (
-            scipy.special.logsumexp(said, axis=0)
+            _logsumexp(said, axis=0)
             - np.log(len(said))
             - n * np.log(np.abs(factors))
             - 0.5 * n * np.log(2 * np.pi)
@@ -386,12 +380,32 @@ class _Model:
         return bool(share == len(_SHARES) - 1 or _SIZES[size] * self.size[j] > _OFF * np.std(column))
 
 
+def _parts(models: Sequence[_Model]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """`_Model.parts` of models with `_MOST` samples together, at most."""
+    q, qd, qdd = (np.concatenate([getattr(m, name) for m in models]) for name in ("q", "qd", "qdd"))
+    n, dof = q.shape
+    gravity = np.repeat([[0, 0, 0], *np.eye(3).tolist()], _MOST, axis=0)
+    q, qd, qdd = (np.pad(x, ((0, _MOST - n), (0, 0))) for x in (q, qd, qdd))
+    at_rest = np.zeros((3 * _MOST, dof))
+    motion = np.tile(q, (4, 1)), np.concatenate([qd, at_rest]), np.concatenate([qdd, at_rest])
+    Y = np.asarray(_regressors(models[0].arm.chain, gravity, *motion)).reshape(4, _MOST, dof, -1)
+    ends = np.cumsum([len(m.q) for m in models])
+    return [(y[0], y[1:]) for y in np.split(Y, ends, axis=1)[:-1]]
+
+
 _regressors = jax.jit(
     jax.vmap(
         lambda chain, gravity, q, qd, qdd: regressor(dataclasses.replace(chain, gravity=gravity), q, qd, qdd),
         in_axes=(None, 0, 0, 0, 0),
     )
 )
+
+
+def _logsumexp(x: np.ndarray, axis: int | None = None, keepdims: bool = False) -> Any:
+    """scipy's, without what it takes to serve many kinds of array."""
+    top = np.max(x, axis=axis, keepdims=True)
+    said = top + np.log(np.sum(np.exp(x - top), axis=axis, keepdims=True))
+    return said if keepdims else np.squeeze(said, axis)
 
 
 def _totals(variances: Float[np.ndarray, " n"], size: float) -> Float[np.ndarray, "n hypotheses"]:
@@ -455,7 +469,7 @@ def _scales(model: _Model) -> list[_Reading]:
     for said, sign in ((plus, 1.0), (minus, -1.0)):
         total = np.where(far, said[moving].sum(0), -np.inf)
         k = int(np.argmax(total))
-        score = prior + float(scipy.special.logsumexp(total))
+        score = prior + float(_logsumexp(total))
         common = float(np.exp(logs[k]))
         known = min(_UNITS.values(), key=lambda unit: abs(np.log(unit / common)))
         if usual[k]:
@@ -467,10 +481,10 @@ def _scales(model: _Model) -> list[_Reading]:
         out.append(_Reading(kind, score, np.full(dof, sign * common), same))
         # a motor's constant a joint, none near 1: each about a common one, of which all are equally likely
         apart = np.where(far, -0.5 * ((logs[:, None] - logs) / _OWN) ** 2, -np.inf)
-        apart -= scipy.special.logsumexp(apart, axis=1, keepdims=True)
-        each = scipy.special.logsumexp(said[moving][:, None] + apart, axis=2)
+        apart -= _logsumexp(apart, axis=1, keepdims=True)
+        each = _logsumexp(said[moving][:, None] + apart, axis=2)
         total = np.where(far, each.sum(0), -np.inf)
-        score = prior + float(scipy.special.logsumexp(total))
+        score = prior + float(_logsumexp(total))
         c = int(np.argmax(total))
         factors = np.full(dof, np.exp(logs[c]))
         factors[moving] = np.exp(logs[np.argmax(said[moving] + apart[c], 1)])
@@ -483,7 +497,7 @@ def _scales(model: _Model) -> list[_Reading]:
     factors, score, count = np.ones(dof), np.log(_PRIOR), 0
     for j in moving:
         alone = np.where(usual, plus[j], -np.inf)  # any number is likelier to be something else at that joint
-        gain = scipy.special.logsumexp(alone) - plus[j, one] - np.log(dof * usual.sum())
+        gain = _logsumexp(alone) - plus[j, one] - np.log(dof * usual.sum())
         if gain > 0:
             k = float(np.exp(logs[np.argmax(alone)]))
             factors[j], count = min(_UNITS.values(), key=lambda unit: abs(np.log(unit / k))), count + 1
@@ -518,7 +532,12 @@ def _orders(model: _Model, plain: float) -> list[_Reading]:
         swaps = [_swapped(best, i, k) for i in range(dof) for k in range(i)]
         fresh = [o for o in (*swaps, best[::-1].copy()) if tuple(o) not in tried]
         tried |= {tuple(o) for o in fresh}
-        order = max(fresh, key=lambda o: _Model(model.arm, coarse, o).evidence())
+        rough = [_Model(model.arm, coarse, order) for order in fresh]
+        room = _MOST // len(coarse.time)
+        for together in (rough[i : i + room] for i in range(0, len(rough), room)):
+            for one_of, parts in zip(together, _parts(together), strict=True):
+                one_of.parts = parts
+        order = max(rough, key=_Model.evidence).order
         top = _Model(model.arm, model.samples, order).evidence()
         if top < score + _NEEDS:
             break
