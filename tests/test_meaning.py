@@ -1,14 +1,14 @@
 """What a torque column is: other readings are named, and models that are merely poor are not taken for them.
 
-The torque is MuJoCo's, of arms that `experiments/concealed` draws; nothing of it is our own dynamics.
+The recordings are those of `experiments/torque_meaning`: torque is MuJoCo's, nothing of it is our own dynamics.
 """
 
 import dataclasses
+import importlib
 import json
 import sys
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -19,164 +19,150 @@ from jaxpanda.meaning import meaning
 from jaxpanda.mjcf import from_mjcf
 from jaxpanda.recordings import save
 
-FOLDER = Path(__file__).parents[1] / "experiments" / "concealed"
-NOISE = 0.08 * np.array([1, 1, 1, 1, 0.5, 0.5, 0.5])
-"""Of the torque [N m]."""
-LIGHT = np.array([1, 1, 1, 1, 0.4, 0.4, 0.4])
-G = 9.81
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+_MODULES = "run", "arms", "motion", "plant"
+SECONDS, RATE = 12.0, 200.0
 
 
 @pytest.fixture(scope="module")
 def trial():
-    """The experiment's modules."""
-    sys.path.insert(0, str(FOLDER))
-    import arm
-    import motions
-
-    sys.path.remove(str(FOLDER))
-    return arm, motions
-
-
-class Case:
-    """An arm, its motion, and its torque with friction that the model lacks."""
-
-    def __init__(self, trial, seed: int, folder: Path):
-        self.made, motions = trial
-        self.rng = rng = np.random.default_rng(seed)
-        self.user = self.made.draw_arm(rng)
-        self.true = dataclasses.replace(
-            self.user, frictionloss=rng.uniform(0.2, 0.8, 7) * LIGHT, damping=rng.uniform(0.2, 1, 7) * LIGHT
-        )
-        family = motions.FAMILIES[seed % len(motions.FAMILIES)]
-        t, self.q, self.v, self.a = (x[600::4] for x in motions.desired(rng, family, 10.0))
-        self.t = t - t[0]
-        self.path = folder / f"arm_{seed}.xml"
-        self.path.write_text(self.made.mjcf(self.user))
-        self.model = from_mjcf(self.path)[0]
-
-    def torque(self, true=None, **changes) -> np.ndarray:
-        """Of the true arm, or another, with noise [N m]."""
-        true = dataclasses.replace(self.true if true is None else true, **changes)
-        engine = mujoco.MjModel.from_xml_string(self.made.mjcf(true, actuators=False))
-        tau = self.made.inverse_dynamics(engine, self.q, self.v, self.a)
-        tau += true.frictionloss * np.tanh(self.v / 0.005)
-        return tau + NOISE * self.rng.normal(size=tau.shape)
-
-    def recorded(self, tau: np.ndarray, order=None) -> Recording:
-        """`order`: in which all columns stand."""
-        at = np.arange(7) if order is None else np.asarray(order)
-        q = self.q + 1e-5 * self.rng.normal(size=self.q.shape)
-        return Recording("arm.csv", self.t, q[:, at], self.v[:, at], tau[:, at])
-
-    def read(self, tau: np.ndarray, order=None):
-        return meaning(self.recorded(tau, order), self.model)
+    """The experiment; other experiments have modules of the same names."""
+    others = {name: sys.modules.pop(name, None) for name in _MODULES}
+    path = list(sys.path)
+    sys.path.insert(0, str(EXPERIMENTS / "torque_meaning"))
+    yield importlib.import_module("run")
+    sys.path[:] = path
+    for name, module in others.items():
+        sys.modules.pop(name, None)
+        if module is not None:
+            sys.modules[name] = module
 
 
-@pytest.fixture(scope="module")
-def case(trial, tmp_path_factory):
-    return Case(trial, 0, tmp_path_factory.mktemp("arm"))
-
-
-@pytest.mark.parametrize("seed", [0, 3])
-def test_a_poor_model_is_not_a_wrong_meaning(trial, seed, tmp_path):
-    """Each of these is physics, or a number that is somewhat off, of which the torque column is not guilty."""
-    case = Case(trial, seed, tmp_path)
-    body = case.made.Body
-    signs = case.rng.choice([-1, 1], 7)
-    links = tuple(
-        body(b.mass * (1 + 0.2 * s), b.com, b.inertia * (1 + 0.2 * s))
-        for b, s in zip(case.true.links, signs, strict=True)
-    )
-    payload = body(3.0, np.array([0.02, 0.0, 0.08]), np.array([0.01, 0.01, 0.01, 0, 0, 0]))
-    tilt = np.radians(5.0)
-    said = {
-        "null": case.read(case.torque(case.user)),
-        "missing friction": case.read(case.torque()),
-        "links": case.read(case.torque(links=links)),
-        "payload": case.read(case.torque(load=payload)),
-        "gain": case.read(case.torque() * (1 + 0.3 * (np.arange(7) == 3))),
-        "tilt": case.read(case.torque(gravity=G * np.array([np.sin(tilt), 0, -np.cos(tilt)]))),
-        "offset": case.read(case.torque() + 0.8 * signs),
-    }
-    assert said == dict.fromkeys(said)
-
-
-@pytest.mark.parametrize("seed", [0, 3])
-def test_torque_without_gravity_is_named(trial, seed, tmp_path):
-    case = Case(trial, seed, tmp_path)
-    found = case.read(case.torque(gravity=np.zeros(3)))
+def named(trial, case: str, seed: int):
+    """What is said of a case, which must be right, and be mended by the options that come with it."""
+    text, recording = trial.made(case, seed, SECONDS, RATE)
+    found, _ = trial.read(text, recording)
     assert found is not None
-    assert found.kind == "gravity_removed"
-    assert found.confidence > 0.9
-    assert "Add gravity" in found.mend
+    assert found.kind == trial.WRONG[case]
+    assert f"`{found.options}`" in found.summary
+    assert trial.read(text, recording, found.options)[0] is None
+    return found
 
 
-@pytest.mark.parametrize("seed", [0, 3])
-def test_reversed_signs_are_named_with_their_joints(trial, seed, tmp_path):
-    case = Case(trial, seed, tmp_path)
-    every = case.read(-case.torque())
-    assert every is not None
-    assert (every.kind, every.joints) == ("sign", tuple(range(7)))
-    one = case.read(case.torque() * np.where(np.arange(7) == 3, -1, 1))
-    assert one is not None
-    assert (one.kind, one.joints) == ("sign", (3,))
+def test_torque_without_gravity_is_named(trial):
+    assert named(trial, "gravity_removed", 1000).options == "--gravity removed"
 
 
-def test_units_and_currents_are_told_from_each_other(case):
-    unit = case.read(1000 * case.torque())
-    assert unit is not None
-    assert (unit.kind, set(unit.factors)) == ("unit", {1000.0})
-    constants = 1 / np.array([15.0, 13.0, 8.0, 11.0, 6.0, 9.0, 7.0])
-    current = case.read(case.torque() * constants)
-    assert current is not None
-    assert current.kind == "current"
-    np.testing.assert_allclose(np.array(current.factors)[[1, 3]], constants[[1, 3]], rtol=0.3)
-    geared = case.read(case.torque() / 101.0)
-    assert geared is not None
-    assert geared.kind == "motor_side"
+def test_a_reversed_sign_is_named_with_its_joint(trial):
+    found = named(trial, "sign of one", 1000)
+    (joint,) = found.joints
+    assert found.options.split()[1:] == ["-" if j == joint else "+" for j in range(7)]
 
 
-def test_columns_out_of_order_are_put_in_order(case):
-    whole = case.read(case.torque(), order=[0, 3, 2, 1, 4, 5, 6])
-    assert whole is not None
-    assert (whole.kind, whole.joints, whole.whole_order) == ("joint_order", (1, 3), True)
-    assert whole.order == (0, 3, 2, 1, 4, 5, 6)
+@pytest.mark.slow
+def test_all_signs_reversed_are_one_sign(trial):
+    assert named(trial, "sign of all", 1000).options == "--torque-sign -"
 
 
-def test_another_mounting_is_named(case):
-    for gravity, word in (((G, 0, 0), "wall"), ((0, 0, G), "ceiling"), ((0, 0, -1.62), "moon")):
-        found = case.read(case.torque(gravity=np.array(gravity, float)))
-        assert found is not None
-        assert found.kind == "mounting"
-        assert word in found.says
-        np.testing.assert_allclose(found.gravity, gravity, atol=0.6)
+def test_a_unit_is_told_from_currents(trial):
+    assert named(trial, "N mm", 1000).options == "--torque-unit mNm"
+    found = named(trial, "current", 1000)
+    assert all(5 < 1 / factor < 18 for factor in found.factors)
 
 
-def test_too_little_to_tell_is_told_nothing(case):
-    whole = case.recorded(1000 * case.torque())
-    assert whole.tau is not None
-    short = Recording("short", whole.time[:200], whole.q[:200], whole.qd[:200], whole.tau[:200])
-    assert meaning(short, case.model) is None
-    assert meaning(Recording("motion", whole.time, whole.q, whole.qd), case.model) is None
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "case", ["motor side", "one in N mm", "two torques swapped", "tilt", "moon", "ceiling"]
+)
+def test_other_meanings_are_named(trial, case):
+    named(trial, case, 1000)
+
+
+def test_columns_out_of_order_are_put_in_order(trial):
+    found = named(trial, "two joints swapped", 1000)
+    assert found.whole_order
+    assert len(found.joints) == 2
+
+
+def test_another_mounting_is_named(trial):
+    found = named(trial, "wall", 1000)
+    assert "on a wall" in found.says
+    assert np.linalg.norm(found.gravity) == pytest.approx(9.81, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    "case", ["exact", "friction", "links", "payload", "gain", "level", "offset", "delay"]
+)
+def test_what_is_missing_in_a_model_is_no_fault_of_the_column(trial, case):
+    """Each of these is physics, or a number that is somewhat off."""
+    assert trial.read(*trial.made(case, 1000, SECONDS, RATE))[0] is None
+
+
+def test_friction_that_stands_in_the_file_for_nothing_is_no_unit(trial, tmp_path):
+    """Joints without a load had "another unit" where the file's damping was a hundred times too large."""
+    text, recording = trial.made("exact", 1000, SECONDS, RATE)
+    path = tmp_path / "arm.xml"
+    path.write_text(text)
+    arm, _ = from_mjcf(path)
+    heavy = dataclasses.replace(arm, damping=arm.damping + 10.0, frictionloss=arm.frictionloss + 3.0)
+    assert meaning(recording, heavy) is None
+
+
+def test_too_little_to_tell_is_told_nothing(trial, tmp_path):
+    text, whole = trial.made("N mm", 1000, SECONDS, RATE)
+    path = tmp_path / "arm.xml"
+    path.write_text(text)
+    arm, _ = from_mjcf(path)
+    short = Recording("short", whole.time[:400], whole.q[:400], whole.qd[:400], whole.tau[:400])
+    assert meaning(short, arm) is None
+    assert meaning(Recording("motion", whole.time, whole.q, whole.qd), arm) is None
     still = Recording("rest", whole.time, 0 * whole.q + whole.q[0], 0 * whole.qd, whole.tau)
-    assert meaning(still, case.model) is None
+    assert meaning(still, arm) is None
 
 
-def test_diagnose_says_what_the_column_is_and_seeks_no_physics_in_it(case, tmp_path):
-    save(case.recorded(case.torque(gravity=np.zeros(3))), tmp_path / "free.csv")
-    command = ["diagnose", "--model", str(case.path), "--recording", str(tmp_path / "free.csv")]
-    assert main([*command, "--out", str(tmp_path / "out")]) == 0
-    document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+def test_samples_on_either_side_of_a_gap_at_the_end_are_read(trial):
+    """The last of the samples that are compared lay behind the end of the recording."""
+    text, recording = trial.made("N mm", 1000, SECONDS, RATE)
+    keep = np.r_[0:2000, 2200:2400]
+    parts = (x[keep] for x in (recording.time, recording.q, recording.qd, recording.tau))
+    found, _ = trial.read(text, Recording("gap", *parts))
+    assert found is not None
+    assert found.kind == "unit"
+
+
+@pytest.fixture
+def files(trial, tmp_path):
+    """A model and a recording whose torque is without gravity, and the command to diagnose it."""
+    text, recording = trial.made("gravity_removed", 1000, SECONDS, RATE)
+    (tmp_path / "arm.xml").write_text(text)
+    save(recording, tmp_path / "free.csv")
+    return tmp_path, ["--model", str(tmp_path / "arm.xml"), "--recording", str(tmp_path / "free.csv")]
+
+
+def test_diagnose_says_what_the_column_is_and_seeks_no_physics_in_it(files):
+    folder, given = files
+    assert main(["diagnose", *given, "--out", str(folder / "out")]) == 0
+    document = json.loads((folder / "out" / "diagnosis.json").read_text())
     (finding,) = document["findings"]
     assert (finding["effect"], finding["family"]) == ("torque_meaning", "meaning")
     assert finding["kind"] == "gravity_removed"
+    assert "--gravity removed" in finding["summary"]
     assert document["verdict"] in ("unexplained", "partly_explained")
-    assert (tmp_path / "out" / "corrected.xml").read_text() == case.path.read_text()
-    assert "gravity" in (tmp_path / "out" / "report.html").read_text()
+    assert (folder / "out" / "corrected.xml").read_text() == (folder / "arm.xml").read_text()
+    assert "--gravity removed" in (folder / "out" / "report.html").read_text()
 
 
-def test_inspect_says_the_same_in_words(case):
-    wall = case.recorded(case.torque(gravity=np.array([G, 0, 0])))
-    assert "on a wall" in "\n".join(inspect(wall, case.model).verdicts)
-    verdicts = inspect(case.recorded(case.torque()), case.model).verdicts
-    assert not any("mounted" in said or "wrong sign" in said for said in verdicts)
+@pytest.mark.slow
+def test_the_option_that_is_named_leads_to_physics(files):
+    folder, given = files
+    assert main(["diagnose", *given, "--out", str(folder / "out"), "--gravity", "removed"]) == 0
+    document = json.loads((folder / "out" / "diagnosis.json").read_text())
+    assert document["findings"]
+    assert all(f["effect"] != "torque_meaning" and f["family"] for f in document["findings"])
+    assert any("gravity torque was added" in note for note in document["notes"])
+
+
+def test_inspect_says_the_same_in_words(trial, tmp_path):
+    text, recording = trial.made("wall", 1000, SECONDS, RATE)
+    (tmp_path / "arm.xml").write_text(text)
+    assert "on a wall" in "\n".join(inspect(recording, from_mjcf(tmp_path / "arm.xml")[0]).verdicts)
