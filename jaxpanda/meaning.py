@@ -64,8 +64,8 @@ _WHITE = 0.03
 """Share of the error's variance that is not correlated."""
 _LINKS = 0.2, 0.02, 0.3
 """Deviations of a link: of its mass, as a share; of its centre of mass [m]; of its inertia, as a share."""
-_LOAD = 2.0, 0.1
-"""Deviations of a payload's mass [kg], and of where it is [m]."""
+_LOAD = 0.15, 0.1
+"""Deviations of a payload's mass, as a share of the arm's, and of where it is [m]."""
 _GAIN, _TILT, _DELAY = 0.25, 0.1, 0.05
 """Deviations of a sensor's gain, as a share; of a base that is not level [rad]; of a delay [s]."""
 _FREE = 1.0
@@ -78,6 +78,8 @@ _FACTORS = np.exp(np.arange(-9.6, 9.7, 0.1))
 """Factors between a column and the torque that are tried."""
 _FAR = 3.0
 """A constant within this factor of 1 is a gain, not a unit."""
+_ALONE = 30.0
+"""A single joint's constant within this factor of 1 is a load, a gain or friction, not a unit."""
 _NEAR = 1.3
 """A constant within this factor of a usual unit is taken for it."""
 _OWN = 0.6
@@ -281,7 +283,8 @@ class _Model:
     def spread(self) -> Float[np.ndarray, "standard n"]:
         """Deviations of links and of a payload at the last one."""
         blocks = [_link_spread(phi) for phi in np.asarray(self.arm.standard)]
-        mass, reach = _LOAD
+        share, reach = _LOAD
+        mass = share * max(float(np.asarray(self.arm.standard)[:, 0].sum()), 1.0)
         payload = np.zeros((10 * self.arm.dof, 10))
         payload[-10:] = np.diag([mass, *3 * [mass * reach], *6 * [mass * reach**2]])
         return np.concatenate([np.asarray(scipy.linalg.block_diag(*blocks)), payload], 1)
@@ -466,6 +469,7 @@ def _scales(model: _Model) -> list[_Reading]:
     usual = far & (np.abs(logs[:, None] - units).min(1) < np.log(_NEAR))
     same = np.arange(dof)
     prior = np.log(_PRIOR) - np.log(far.sum())
+    single = usual & (np.abs(logs) > np.log(_ALONE))
     for said, sign in ((plus, 1.0), (minus, -1.0)):
         total = np.where(far, said[moving].sum(0), -np.inf)
         k = int(np.argmax(total))
@@ -496,8 +500,8 @@ def _scales(model: _Model) -> list[_Reading]:
     one = int(np.argmin(np.abs(logs)))
     factors, score, count = np.ones(dof), np.log(_PRIOR), 0
     for j in moving:
-        alone = np.where(usual, plus[j], -np.inf)  # any number is likelier to be something else at that joint
-        gain = _logsumexp(alone) - plus[j, one] - np.log(dof * usual.sum())
+        alone = np.where(single, plus[j], -np.inf)  # other numbers are likelier to be something else there
+        gain = _logsumexp(alone) - plus[j, one] - np.log(dof * single.sum())
         if gain > 0:
             k = float(np.exp(logs[np.argmax(alone)]))
             factors[j], count = min(_UNITS.values(), key=lambda unit: abs(np.log(unit / k))), count + 1

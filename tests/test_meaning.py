@@ -14,14 +14,16 @@ import pytest
 
 from jaxpanda import Recording
 from jaxpanda.__main__ import main
-from jaxpanda.inspection import inspect
+from jaxpanda.diagnosis.finding import FAMILIES
+from jaxpanda.effects import CATALOGUE
 from jaxpanda.meaning import meaning
 from jaxpanda.mjcf import from_mjcf
 from jaxpanda.recordings import save
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 _MODULES = "run", "arms", "motion", "plant"
-SECONDS, RATE = 12.0, 200.0
+CASE = 1000, 12.0, 200.0, "panda_like"
+"""Seed, seconds, rate and arm of the recordings."""
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +40,9 @@ def trial():
             sys.modules[name] = module
 
 
-def named(trial, case: str, seed: int):
+def named(trial, case: str):
     """What is said of a case, which must be right, and be mended by the options that come with it."""
-    text, recording = trial.made(case, seed, SECONDS, RATE)
+    text, recording = trial.made(case, *CASE)
     found, _ = trial.read(text, recording)
     assert found is not None
     assert found.kind == trial.WRONG[case]
@@ -50,23 +52,23 @@ def named(trial, case: str, seed: int):
 
 
 def test_torque_without_gravity_is_named(trial):
-    assert named(trial, "gravity_removed", 1000).options == "--gravity removed"
+    assert named(trial, "gravity_removed").options == "--gravity removed"
 
 
 def test_a_reversed_sign_is_named_with_its_joint(trial):
-    found = named(trial, "sign of one", 1000)
+    found = named(trial, "sign of one")
     (joint,) = found.joints
     assert found.options.split()[1:] == ["-" if j == joint else "+" for j in range(7)]
 
 
 @pytest.mark.slow
 def test_all_signs_reversed_are_one_sign(trial):
-    assert named(trial, "sign of all", 1000).options == "--torque-sign -"
+    assert named(trial, "sign of all").options == "--torque-sign -"
 
 
 def test_a_unit_is_told_from_currents(trial):
-    assert named(trial, "N mm", 1000).options == "--torque-unit mNm"
-    found = named(trial, "current", 1000)
+    assert named(trial, "N mm").options == "--torque-unit mNm"
+    found = named(trial, "current")
     assert all(5 < 1 / factor < 18 for factor in found.factors)
 
 
@@ -75,17 +77,17 @@ def test_a_unit_is_told_from_currents(trial):
     "case", ["motor side", "one in N mm", "two torques swapped", "tilt", "moon", "ceiling"]
 )
 def test_other_meanings_are_named(trial, case):
-    named(trial, case, 1000)
+    named(trial, case)
 
 
 def test_columns_out_of_order_are_put_in_order(trial):
-    found = named(trial, "two joints swapped", 1000)
+    found = named(trial, "two joints swapped")
     assert found.whole_order
     assert len(found.joints) == 2
 
 
 def test_another_mounting_is_named(trial):
-    found = named(trial, "wall", 1000)
+    found = named(trial, "wall")
     assert "on a wall" in found.says
     assert np.linalg.norm(found.gravity) == pytest.approx(9.81, abs=1.0)
 
@@ -95,12 +97,12 @@ def test_another_mounting_is_named(trial):
 )
 def test_what_is_missing_in_a_model_is_no_fault_of_the_column(trial, case):
     """Each of these is physics, or a number that is somewhat off."""
-    assert trial.read(*trial.made(case, 1000, SECONDS, RATE))[0] is None
+    assert trial.read(*trial.made(case, *CASE))[0] is None
 
 
 def test_friction_that_stands_in_the_file_for_nothing_is_no_unit(trial, tmp_path):
     """Joints without a load had "another unit" where the file's damping was a hundred times too large."""
-    text, recording = trial.made("exact", 1000, SECONDS, RATE)
+    text, recording = trial.made("exact", *CASE)
     path = tmp_path / "arm.xml"
     path.write_text(text)
     arm, _ = from_mjcf(path)
@@ -109,7 +111,7 @@ def test_friction_that_stands_in_the_file_for_nothing_is_no_unit(trial, tmp_path
 
 
 def test_too_little_to_tell_is_told_nothing(trial, tmp_path):
-    text, whole = trial.made("N mm", 1000, SECONDS, RATE)
+    text, whole = trial.made("N mm", *CASE)
     path = tmp_path / "arm.xml"
     path.write_text(text)
     arm, _ = from_mjcf(path)
@@ -122,7 +124,7 @@ def test_too_little_to_tell_is_told_nothing(trial, tmp_path):
 
 def test_samples_on_either_side_of_a_gap_at_the_end_are_read(trial):
     """The last of the samples that are compared lay behind the end of the recording."""
-    text, recording = trial.made("N mm", 1000, SECONDS, RATE)
+    text, recording = trial.made("N mm", *CASE)
     keep = np.r_[0:2000, 2200:2400]
     parts = (x[keep] for x in (recording.time, recording.q, recording.qd, recording.tau))
     found, _ = trial.read(text, Recording("gap", *parts))
@@ -133,7 +135,7 @@ def test_samples_on_either_side_of_a_gap_at_the_end_are_read(trial):
 @pytest.fixture
 def files(trial, tmp_path):
     """A model and a recording whose torque is without gravity, and the command to diagnose it."""
-    text, recording = trial.made("gravity_removed", 1000, SECONDS, RATE)
+    text, recording = trial.made("gravity_removed", *CASE)
     (tmp_path / "arm.xml").write_text(text)
     save(recording, tmp_path / "free.csv")
     return tmp_path, ["--model", str(tmp_path / "arm.xml"), "--recording", str(tmp_path / "free.csv")]
@@ -162,7 +164,7 @@ def test_the_option_that_is_named_leads_to_physics(files):
     assert any("gravity torque was added" in note for note in document["notes"])
 
 
-def test_inspect_says_the_same_in_words(trial, tmp_path):
-    text, recording = trial.made("wall", 1000, SECONDS, RATE)
-    (tmp_path / "arm.xml").write_text(text)
-    assert "on a wall" in "\n".join(inspect(recording, from_mjcf(tmp_path / "arm.xml")[0]).verdicts)
+def test_every_effect_of_the_catalogue_has_a_family():
+    words = {"friction", "drive", "load", "sensor", "clock", "contact", "meaning", "unknown"}
+    assert set(FAMILIES.values()) == words
+    assert {effect.name for effect in CATALOGUE} - {"unknown"} <= set(FAMILIES)

@@ -55,10 +55,10 @@ def torque(arm, rng, q, qd, qdd):
     return tau + arm.noise * rng.standard_normal(tau.shape)
 
 
-def made(case: str, seed: int, seconds: float, rate: float):
-    """A case: the user's file as text, and the columns of the recording."""
+def made(case: str, seed: int, seconds: float, rate: float, arm: str | None = None):
+    """A case: the user's file as text, and the columns of the recording; of any arm, unless one is named."""
     rng = np.random.default_rng([seed, *case.encode()])
-    user = arms.draw_arm(rng)
+    user = arms.draw_arm(rng, arm)
     n = user.n
     family = str(rng.choice(["fourier", "pick", "reversals", "mixed", "slow"]))
     step = round(1 / rate / motion.DT)
