@@ -76,10 +76,10 @@ _SMALL = 0.1
 """Least size of a joint's torque, as a share of the largest joint's."""
 _FACTORS = np.exp(np.arange(-9.6, 9.7, 0.1))
 """Factors between a column and the torque that are tried."""
-_FAR = 3.0
-"""A constant within this factor of 1 is a gain, not a unit."""
+_FAR = 5.0
+"""A constant within this factor of 1 is a gain, a load or links, not a unit."""
 _ALONE = 30.0
-"""A single joint's constant within this factor of 1 is a load, a gain or friction, not a unit."""
+"""Below this a single joint's constant is a load, a gain or friction that the model lacks or has, not a unit."""
 _NEAR = 1.3
 """A constant within this factor of a usual unit is taken for it."""
 _OWN = 0.6
@@ -469,7 +469,7 @@ def _scales(model: _Model) -> list[_Reading]:
     usual = far & (np.abs(logs[:, None] - units).min(1) < np.log(_NEAR))
     same = np.arange(dof)
     prior = np.log(_PRIOR) - np.log(far.sum())
-    single = usual & (np.abs(logs) > np.log(_ALONE))
+    single = usual & (logs > np.log(_ALONE))
     for said, sign in ((plus, 1.0), (minus, -1.0)):
         total = np.where(far, said[moving].sum(0), -np.inf)
         k = int(np.argmax(total))
@@ -493,9 +493,8 @@ def _scales(model: _Model) -> list[_Reading]:
         factors = np.full(dof, np.exp(logs[c]))
         factors[moving] = np.exp(logs[np.argmax(said[moving] + apart[c], 1)])
         median = float(np.median(factors[moving]))
-        geared = 1 / _GEARS[1] < median < 1 / _GEARS[0] and bool(
-            np.all(factors[moving] < 1 / _GEARS[0] * 1.5)
-        )
+        slow = factors[moving] < 1 / _GEARS[0] * 1.5  # friction may hide one joint's
+        geared = 1 / _GEARS[1] < median < 1 / _GEARS[0] and int(np.sum(~slow)) <= 1
         out.append(_Reading("motor_side" if geared else "current", score, sign * factors, same))
     one = int(np.argmin(np.abs(logs)))
     factors, score, count = np.ones(dof), np.log(_PRIOR), 0
