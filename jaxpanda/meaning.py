@@ -695,7 +695,7 @@ def _scale_words(best: _Reading, joints: np.ndarray, named: str) -> tuple[str, s
         k = float(sizes[0])
         unit = next((name for name, size in _UNITS.items() if size == k), "")
         options = f"--torque-unit {unit or f'{1 / k:.3g}'}{reverse}"
-        says = f"The torque column is {k:.3g} times the joint torque" + (f": {unit}." if unit else ".")
+        says = f"The torque column is {k:.4g} times the joint torque" + (f": {unit}." if unit else ".")
         return says, options, f"Give `{options}`."
     options = f"--torque-unit {worth}{reverse}"
     says = (

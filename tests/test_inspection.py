@@ -89,7 +89,7 @@ def test_a_torque_in_other_units_is_noticed():
     good = virtual()
     assert good.tau is not None
     found = inspect(Recording("millinewtons", good.time, good.q, good.qd, 1000 * good.tau), panda())
-    assert "1e+03 times the joint torque: N·mm" in said(found)
+    assert "1000 times the joint torque: mNm. Give `--torque-unit mNm`." in said(found)
 
 
 def test_gravity_taken_out_by_the_controller_is_noticed():

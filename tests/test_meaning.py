@@ -66,8 +66,12 @@ def test_all_signs_reversed_are_one_sign(trial):
     assert named(trial, "sign of all").options == "--torque-sign -"
 
 
-def test_a_unit_is_told_from_currents(trial):
+def test_a_unit_is_named(trial):
     assert named(trial, "N mm").options == "--torque-unit mNm"
+
+
+@pytest.mark.slow
+def test_currents_are_named_with_what_they_are_worth(trial):
     found = named(trial, "current")
     worth = 1 / np.array(found.factors)  # 5 to 18 N·m/A; friction hides some of it
     assert 5 < np.median(worth) < 18
