@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import record
 
 from jaxpanda import Recording
 from jaxpanda.__main__ import main
 from jaxpanda.convention import PLAIN, Convention
-from jaxpanda.demo import record
 from jaxpanda.errors import InputError
 from jaxpanda.markup import parse
 from jaxpanda.mjcf import from_document, from_mjcf, with_gravity
@@ -102,7 +102,7 @@ def test_gravity_is_put_where_the_file_has_it(options):
 
 @pytest.fixture(scope="module")
 def log():
-    return record(seed=3, duration=4.0).recording
+    return record(3, seconds=6.0)
 
 
 def verdicts(capsys, path, *options: str) -> str:

@@ -86,6 +86,7 @@ def test_other_meanings_are_named(trial, case):
     named(trial, case)
 
 
+@pytest.mark.slow
 def test_columns_out_of_order_are_put_in_order(trial):
     found = named(trial, "two joints swapped")
     assert found.whole_order
@@ -128,6 +129,7 @@ def test_too_little_to_tell_is_told_nothing(trial, tmp_path):
     assert meaning(still, arm) is None
 
 
+@pytest.mark.slow
 def test_samples_on_either_side_of_a_gap_at_the_end_are_read(trial):
     """The last of the samples that are compared lay behind the end of the recording."""
     text, recording = trial.made("N mm", *CASE)
