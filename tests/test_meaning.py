@@ -162,16 +162,6 @@ def test_diagnose_says_what_the_column_is_and_seeks_no_physics_in_it(files):
     assert "--gravity removed" in (folder / "out" / "report.html").read_text()
 
 
-@pytest.mark.slow
-def test_the_option_that_is_named_leads_to_physics(files):
-    folder, given = files
-    assert main(["diagnose", *given, "--out", str(folder / "out"), "--gravity", "removed"]) == 0
-    document = json.loads((folder / "out" / "diagnosis.json").read_text())
-    assert document["findings"]
-    assert all(f["effect"] != "torque_meaning" and f["family"] for f in document["findings"])
-    assert any("gravity torque was added" in note for note in document["notes"])
-
-
 def test_every_effect_of_the_catalogue_has_a_family():
     words = {"friction", "drive", "load", "sensor", "clock", "contact", "meaning", "unknown"}
     assert set(FAMILIES.values()) == words
