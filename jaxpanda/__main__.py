@@ -13,13 +13,17 @@ import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
+from .convention import PLAIN, Convention
 from .errors import InputError
+
+_Convention = Annotated[Convention, tyro.conf.arg(name="")]
+"""Options of every command that reads recordings with torque."""
 
 # Before numpy is imported: its matrices are small here, and threads on them cost more than they save (a
 # diagnosis takes half the time without).
@@ -58,13 +62,14 @@ class Inspect:
     """Recordings to look at."""
     model: Path | None = None
     """The arm (MJCF); without it, the project's own Panda."""
+    convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.inspect_files(self.recording, self.model)
+        return pipeline.inspect_files(self.recording, self.model, self.convention)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +95,7 @@ class Identify:
     """Of the zero-phase low-pass on regressor and torque alike [Hz]."""
     folds: int = 5
     """Of the phase-blocked cross-validation."""
+    convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -106,6 +112,7 @@ class Identify:
             weighting=self.weighting,
             cutoff=self.cutoff,
             folds=self.folds,
+            convention=self.convention,
         )
 
 
@@ -184,6 +191,7 @@ class Validate:
     """Of the zero-phase low-pass on both torques [Hz]."""
     no_mjx: bool = False
     """Leave MJX out, which takes most of the time on a CPU; roll-outs are then C MuJoCo's alone."""
+    convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -191,7 +199,12 @@ class Validate:
         from . import pipeline
 
         return pipeline.validate_files(
-            self.out, self.model, self.recording, cutoff=self.cutoff, in_mjx=not self.no_mjx
+            self.out,
+            self.model,
+            self.recording,
+            cutoff=self.cutoff,
+            in_mjx=not self.no_mjx,
+            convention=self.convention,
         )
 
 
@@ -209,13 +222,16 @@ class Diagnose:
     """Recordings of the same arm from when nothing was wrong."""
     knowledge: Literal["exact", "identified", "rough", "unknown"] = "identified"
     """How well the numbers in the model are known."""
+    convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
         from . import diagnosis
 
-        return diagnosis.diagnose_files(self.out, self.model, self.recording, self.reference, self.knowledge)
+        return diagnosis.diagnose_files(
+            self.out, self.model, self.recording, self.reference, self.knowledge, self.convention
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,6 +270,7 @@ class Payload:
     called a flange, else the last link's body."""
     torque_scale_std: float = 0.0
     """By which share all torques may be off together, as 0.1 for motor currents times gains known to 10 %."""
+    convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -267,6 +284,7 @@ class Payload:
             self.with_,
             frame=self.frame,
             torque_scale_std=self.torque_scale_std,
+            convention=self.convention,
         )
 
 
@@ -306,9 +324,7 @@ def _sentence(arguments: list[str], panel: str) -> str:
         known = [*commands, "--help", "--version"]
         what = f"no command {name!r}{_meant(name, known)}" if name else "no command given"
         return f"{what}; there are {', '.join(commands)}: see jaxpanda --help"
-    fields = {
-        "--" + field.name.rstrip("_").replace("_", "-"): field for field in dataclasses.fields(commands[name])
-    }
+    fields = {"--" + field.name.rstrip("_").replace("_", "-"): field for field in _fields(commands[name])}
     given = _options(arguments)
     words = " ".join(line.strip("╭╮╰╯│─+|- ") for line in panel.splitlines())  # a frame, of lines or of ASCII
     text = " ".join(re.sub(r"[-─]{3,}", " ", words).split())
@@ -334,6 +350,13 @@ def _sentence(arguments: list[str], panel: str) -> str:
     else:
         what = re.sub(r"^[A-Z][a-z]+ [a-z]+ | ?For full helptext.*$", "", text).replace("•", " ").strip()
     return f"{what}; see jaxpanda {name} --help"
+
+
+def _fields(command: Any) -> Iterator[dataclasses.Field[Any]]:
+    """The options of a command, those that it shares with others included."""
+    for field in dataclasses.fields(command):
+        shared = dataclasses.is_dataclass(field.default)
+        yield from _fields(field.default) if shared else [field]
 
 
 def _options(arguments: list[str]) -> list[str]:

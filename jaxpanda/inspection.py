@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from .arm import Arm, unit_of
 from .errors import require_x64
+from .meaning import Meaning, meaning
 from .recordings import Recording
 from .recordings.checks import velocity_scale
 from .signals import LONGEST_GAP, Signals, prepare, repeatability, white_noise, zero_phase
@@ -218,8 +219,9 @@ def inspect(recording: Recording, arm: Arm | None = None) -> Inspection:
         notes=signals.notes,
         verdicts=(),
     )
+    read = None if arm is None else meaning(recording, arm)
     verdicts = (
-        _time_verdicts(inspection) + _unit_verdicts(inspection, arm) + _torque_verdicts(inspection, arm)
+        _time_verdicts(inspection) + _unit_verdicts(inspection, arm) + _torque_verdicts(inspection, arm, read)
     )
     return dataclasses.replace(inspection, verdicts=tuple(verdicts + _motion_verdicts(inspection)))
 
@@ -419,11 +421,13 @@ def _unit_verdicts(found: Inspection, arm: Arm | None) -> list[str]:
     return said
 
 
-def _torque_verdicts(found: Inspection, arm: Arm | None) -> list[str]:
+def _torque_verdicts(found: Inspection, arm: Arm | None, read: Meaning | None) -> list[str]:
     if "tau" not in found.channels:
         return ["no torque: a motion, which can be predicted for but not identified from"]
     if arm is None:
         return ["torque's unit and sign cannot be told without a model"]
+    if read is not None:
+        return [read.summary]
     said = []
     scales = {joint.joint: joint.torque_scale for joint in found.joints if joint.torque_scale is not None}
     gravity = {joint.joint: joint.gravity_scale for joint in found.joints if joint.gravity_scale is not None}

@@ -107,16 +107,34 @@ def own_log() -> Iterator[list[str]]:
         mujoco.set_mju_user_warning(before)
 
 
-def from_mjcf(path: str | Path) -> tuple[Arm, MjcfSource]:
+def from_mjcf(path: str | Path, gravity: Sequence[float] | None = None) -> tuple[Arm, MjcfSource]:
     """The serial arm in an MJCF file, and where its parts stand in it.
 
     Meshes may be missing where a body has its `inertial`. `gravcomp` is no part of the arm: it is a force of
     the simulation, while a measured torque carries the weight.
 
+    Args:
+        path: of the file.
+        gravity: in place of the file's, in the frame of its world [m/s²].
+
     Raises:
         InputError: no MJCF, one that MuJoCo refuses, or something that a serial arm cannot represent.
     """
-    return from_document(markup.read(path, "mujoco"))
+    return from_document(with_gravity(markup.read(path, "mujoco"), gravity))
+
+
+def with_gravity(document: markup.Document, gravity: Sequence[float] | None) -> markup.Document:
+    """The file with this gravity, in the frame of its world [m/s²], or as it is where that is None."""
+    if gravity is None:
+        return document
+    value = markup.numbers(gravity)
+    options = [element for element in document.root.children if element.tag == "option"]
+    said = [option for option in options if "gravity" in option.attributes] or options[:1]
+    edits = [markup.Edit(option, {"gravity": value}) for option in said]
+    if not said:
+        edits = [markup.Edit(document.root, first_child=f'<option gravity="{value}"/>')]
+    flags = [flag for option in options for flag in option.children if "gravity" in flag.attributes]
+    return markup.edit(document, [*edits, *(markup.Edit(flag, {"gravity": None}) for flag in flags)])
 
 
 def from_document(document: markup.Document, dropped: frozenset[int] | None = None) -> tuple[Arm, MjcfSource]:

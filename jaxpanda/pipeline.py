@@ -11,6 +11,7 @@ import numpy as np
 
 from . import markup
 from .arm import Arm
+from .convention import PLAIN, Convention
 from .errors import InputError
 from .export import Change, panda_mjcf, read_sidecar, write_parameters
 from .files import output_folder, write_text
@@ -26,16 +27,24 @@ from .urdf import left_out, to_urdf
 from .validation import Validation, validate
 
 
-def arm_of(model: Path | None) -> Arm:
-    """The arm in a user's MJCF; without one, the project's own Panda."""
-    return Arm.panda() if model is None else Arm.from_mjcf(model)
+def arm_of(model: Path | None, gravity: Sequence[float] | None = None) -> Arm:
+    """The arm in a user's MJCF, or under another gravity; without a file, the project's own Panda."""
+    arm = Arm.panda() if model is None else Arm.from_mjcf(model)
+    if gravity is None:
+        return arm
+    return dataclasses.replace(arm, chain=dataclasses.replace(arm.chain, gravity=jnp.asarray(gravity)))
 
 
-def recordings_of(paths: Sequence[Path], arm: Arm | None = None) -> list[Recording]:
-    """Read recordings, and make sure that they are of this arm."""
+def recordings_of(
+    paths: Sequence[Path],
+    arm: Arm | None = None,
+    model: Path | None = None,
+    convention: Convention = PLAIN,
+) -> list[Recording]:
+    """Read recordings by the convention of their columns, and make sure that they are of this arm."""
     if not paths:
         raise InputError("--recording: none given; name at least one file or folder")
-    recordings = distinct(load_many(paths))
+    recordings = distinct(convention.applied(load_many(paths), model))
     for recording in recordings:
         if arm is not None:
             recording.require_dof(arm.dof)
@@ -52,12 +61,12 @@ class Inspections:
         return {"schema": "jaxpanda.inspections/1", "recordings": [one.to_json() for one in self.recordings]}
 
 
-def inspect_files(paths: Sequence[Path], model: Path | None) -> Inspections:
+def inspect_files(paths: Sequence[Path], model: Path | None, convention: Convention = PLAIN) -> Inspections:
     """`jaxpanda inspect`."""
-    recordings = recordings_of(paths)
+    recordings = recordings_of(paths, None, model, convention)
     if model is None and any(recording.dof != Arm.panda().dof for recording in recordings):
         return Inspections(tuple(inspect(recording) for recording in recordings))
-    arm = arm_of(model)
+    arm = arm_of(model, convention.mounting)
     return Inspections(tuple(inspect(recording, arm) for recording in recordings))
 
 
@@ -72,18 +81,19 @@ def identify_files(
     weighting: str,
     cutoff: float,
     folds: int,
+    convention: Convention = PLAIN,
 ) -> Identification:
     """`jaxpanda identify`."""
     if (mass_gravity is None) == (not recordings):
         raise InputError("identify: give either --recording or --mass-gravity, one of the two")
-    arm = arm_of(model)
+    arm = arm_of(model, convention.mounting)
     with output_folder(out) as folder:
         if mass_gravity is not None:
             found = identify_mass_gravity(mass_gravity, arm, folds=folds)
         else:
             with progress("identifying") as tick:
                 found = identify(
-                    recordings_of(recordings, arm),
+                    recordings_of(recordings, arm, model, convention),
                     arm,
                     method=method,
                     friction=friction,
@@ -209,14 +219,23 @@ def _identified_file(links: Retrieval) -> Path | None:
 
 
 def validate_files(
-    out: Path, model: Path, recordings: Sequence[Path], *, cutoff: float, in_mjx: bool = True
+    out: Path,
+    model: Path,
+    recordings: Sequence[Path],
+    *,
+    cutoff: float,
+    in_mjx: bool = True,
+    convention: Convention = PLAIN,
 ) -> Validation:
     """`jaxpanda validate`: with the offset in an exported file's sidecar, and what the lint has to say."""
     engines = "MuJoCo and MJX; MJX takes most of the time, --no-mjx leaves it out" if in_mjx else "MuJoCo"
     with output_folder(out) as folder, telling("validating") as say:
         say(f"comparing inverse dynamics, torque and a roll-out in {engines}")
         friction, beside = beyond_mjcf(model)
-        checked = validate(model, recordings_of(recordings), cutoff=cutoff, in_mjx=in_mjx, friction=friction)
+        read = recordings_of(recordings, None, model, convention)
+        checked = validate(
+            model, read, cutoff=cutoff, in_mjx=in_mjx, friction=friction, gravity=convention.mounting
+        )
         slips = tuple(f"{slip.severity}: {slip.where}: {slip.message}" for slip in lint(model))
         checked = dataclasses.replace(checked, notes=(*checked.notes, *beside, *slips))
         checked.save(folder)

@@ -374,6 +374,7 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Validation": validation,
     "Diagnosis": diagnosis,
     "AtRest": diagnosis,
+    "Misread": diagnosis,
     "Prediction": prediction,
     "PayloadEstimate": payload,
     "Demonstration": lambda result: result.sections,

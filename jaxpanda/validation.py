@@ -170,6 +170,7 @@ def validate(
     rollout: bool = True,
     in_mjx: bool = True,
     friction: Friction | None = None,
+    gravity: Sequence[float] | None = None,
 ) -> Validation:
     """Check an MJCF in MuJoCo and MJX, and against recordings.
 
@@ -181,13 +182,14 @@ def validate(
         in_mjx: whether to ask MJX as well, which on a CPU takes most of the time.
         friction: of the joints beyond what the file holds (what MJCF has no place for: an offset, a
             sigmoid); counts in `rmse` and in the roll-out, where it acts as an external torque.
+        gravity: in place of the file's, in the frame of its world [m/s²].
 
     Raises:
         InputError: no such model or none of a serial arm, no recording, or one of another arm or without
             torque.
     """
     require_x64("validate")
-    arm, source = from_mjcf(model)
+    arm, source = from_mjcf(model, gravity)
     motions = [_prepared(recording, arm, cutoff) for recording in recordings]
     if not motions:
         raise InputError(f"{model}: nothing to validate against; give at least one recording")

@@ -74,7 +74,7 @@ def test_a_reversed_torque_is_noticed():
     good = virtual()
     assert good.tau is not None
     found = inspect(Recording("reversed", good.time, good.q, good.qd, -good.tau), panda())
-    assert "wrong sign" in said(found)
+    assert "torque column of all joints has the wrong sign" in said(found)
     assert "torque in N m, positive" not in said(found)
 
 
@@ -82,14 +82,14 @@ def test_one_reversed_joint_is_named():
     good = virtual()
     assert good.tau is not None
     found = inspect(Recording("one", good.time, good.q, good.qd, good.tau * [1, 1, 1, -1, 1, 1, 1]), panda())
-    assert "wrong sign on joints 4:" in said(found)
+    assert "torque column of joint 4 has the wrong sign" in said(found)
 
 
 def test_a_torque_in_other_units_is_noticed():
     good = virtual()
     assert good.tau is not None
     found = inspect(Recording("millinewtons", good.time, good.q, good.qd, 1000 * good.tau), panda())
-    assert "times what the model needs: check its unit" in said(found)
+    assert "1000 times the joint torque: mNm. Give `--torque-unit mNm`." in said(found)
 
 
 def test_gravity_taken_out_by_the_controller_is_noticed():
@@ -97,7 +97,7 @@ def test_gravity_taken_out_by_the_controller_is_noticed():
     assert good.tau is not None
     gravity = jax.vmap(lambda q: gravity_torque(arm.chain, arm.standard, q))(jnp.asarray(good.q))
     found = inspect(Recording("free", good.time, good.q, good.qd, good.tau - np.asarray(gravity)), arm)
-    assert "gravity is not in the torque" in said(found)
+    assert "torque column holds no gravity" in said(found)
 
 
 def test_a_joint_that_rests_is_named_and_shows_less():

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import report
+from ..convention import PLAIN, Convention
 from ..corrected import XML, read
 from ..errors import InputError
 from ..export import missing_assets
@@ -18,7 +19,7 @@ from ..files import output_folder, write_text
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
 from ..session import telling
-from . import page, resting
+from . import meaning, page, resting
 from .diagnosis import Diagnosis, diagnose, predict
 from .host import on_host
 from .knowledge import Knowledge
@@ -59,18 +60,24 @@ def diagnose_files(
     recordings: Sequence[Path],
     reference: Sequence[Path],
     knowledge: Knowledge,
-) -> Diagnosis | resting.AtRest:
+    convention: Convention = PLAIN,
+) -> Diagnosis | resting.AtRest | meaning.Misread:
     """`jaxpanda diagnose`."""
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
     with output_folder(out) as folder, telling("diagnosing") as say:
         count = len(recordings) + len(reference)
         say(f"reading {count} recording{'s' * (count != 1)}")
-        suspect, healthy = load_many(recordings), load_many(reference)
+        suspect, healthy = (convention.applied(load_many(ps), model) for ps in (recordings, reference))
         every = distinct([*suspect, *healthy])
         suspect, healthy = every[: len(suspect)], every[len(suspect) :]
         found = diagnose(
-            model, suspect, reference=healthy, knowledge=knowledge, progress=lambda line: say(plainly(line))
+            model,
+            suspect,
+            reference=healthy,
+            knowledge=knowledge,
+            gravity=convention.mounting,
+            progress=lambda line: say(plainly(line)),
         )
         given = [("model", p) for p in [model] if p]
         given += [("recording", p) for p in recordings] + [("reference", p) for p in reference]
@@ -81,6 +88,8 @@ def diagnose_files(
         found = dataclasses.replace(found, sources=sources, notes=notes)
         if isinstance(found, resting.AtRest):
             sections = resting.sections(found)
+        elif isinstance(found, meaning.Misread):
+            sections = meaning.sections(found)
         else:
             say("simulating both arms along a recording")
             found = _replayed(found, suspect)

@@ -235,6 +235,7 @@ def _finding(
         evidence=float(sum(rivals[i][0] for i in members)),
         summary=summary,
         terms=tuple(members),
+        kind=getattr(terms[0].effect, "form", ""),
     )
 
 

@@ -27,7 +27,7 @@ from ..export import (
     write_parameters,
 )
 from ..feasible.nearest import are_buildable, nearest_buildable
-from ..mjcf import MjcfSource, from_document, from_mjcf
+from ..mjcf import MjcfSource, from_document, from_mjcf, with_gravity
 from ..recordings import Recording, distinct, load
 from ..session import Say, silent
 from . import knowledge as knowledge_
@@ -37,6 +37,7 @@ from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import Finding, Fit
 from .host import on_host
 from .localise import Localisation, localise, unbiased
+from .meaning import Misread, misread
 from .next_motion import NextMotion, next_motion
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
@@ -177,15 +178,18 @@ def diagnose(
     *,
     reference: Sequence[str | Path | Recording] = (),
     knowledge: knowledge_.Knowledge = "identified",
+    gravity: Sequence[float] | None = None,
     progress: Say = silent,
-) -> Diagnosis | AtRest:
-    """Say which physics a simulation is missing; of an arm that holds still, what friction at rest leaves open.
+) -> Diagnosis | AtRest | Misread:
+    """Say which physics a simulation is missing; of an arm that holds still, what friction at rest leaves open;
+    of torque that is not what inverse dynamics gives, what it is.
 
     Args:
         model: the simulation (MJCF) as the user has it; None for the project's own Panda.
         recordings: of the arm, with torque.
         reference: recordings of the same arm from when nothing was wrong; what they show is not reported.
         knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` explains the words.
+        gravity: in place of the model's, in the frame of its world [m/s²].
         progress: called with what is being done, and with each line of `log` as it is written.
 
     Raises:
@@ -194,9 +198,10 @@ def diagnose(
     require_x64("a diagnosis")
     knowledge_.check(knowledge)
     if model is None:
-        arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", Path("panda.xml")))
+        own = markup.parse(panda_mjcf(), "mujoco", Path("panda.xml"))
+        arm, source = from_document(with_gravity(own, gravity))
     else:
-        arm, source = from_mjcf(model)
+        arm, source = from_mjcf(model, gravity)
     if not recordings:
         raise InputError("no recording: a diagnosis needs at least one")
     loaded = [one if isinstance(one, Recording) else load(one) for one in (*recordings, *reference)]
@@ -212,6 +217,10 @@ def diagnose(
         return judge(suspect, healthy, source, knowledge)
     for recording in loaded:
         _require_live_torque(recording)
+    in_question = [one for one, on in zip(distinct(loaded), active, strict=True) if on]
+    wrongly_read = misread(in_question, suspect, source, knowledge)
+    if wrongly_read is not None:
+        return wrongly_read
     progress("looking for effects that make the recordings likelier; that takes most of the time")
     log = _Log(progress)
     premises, state = settled(tuple(traces), tuple(active), knowledge, log)

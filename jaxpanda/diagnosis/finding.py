@@ -7,6 +7,34 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+FAMILIES = {
+    **dict.fromkeys(
+        (
+            "viscous_friction",
+            "coulomb_friction",
+            "asymmetric_friction",
+            "stribeck_friction",
+            "load_dependent_friction",
+            "friction_drift",
+            "presliding_hysteresis",
+            "power_law_friction",
+        ),
+        "friction",
+    ),
+    **dict.fromkeys(("torque_ripple", "backlash", "joint_elasticity", "armature"), "drive"),
+    **dict.fromkeys(
+        ("inertial_parameters", "payload", "payload_change", "gravity_direction", "joint_spring"), "load"
+    ),
+    **dict.fromkeys(
+        ("torque_offset", "torque_gain", "torque_drift", "torque_crosstalk", "encoder_offset"), "sensor"
+    ),
+    "time_delay": "clock",
+    "external_contact": "contact",
+    "torque_meaning": "meaning",
+    "unknown": "unknown",
+}
+"""The family of each effect that a finding may have."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
@@ -30,10 +58,19 @@ class Finding:
     """Which terms of the model it consists of."""
     posterior: float | None = None
     """Weight among the models compared, of which `calibration` made the confidence."""
+    kind: str = ""
+    """Which form of the effect; "" where it has one."""
+
+    @property
+    def family(self) -> str:
+        """Which part of the arm, or of its recording, the effect belongs to: a word of `FAMILIES`' values."""
+        return FAMILIES.get(self.effect, "unknown")
 
     def to_json(self) -> dict[str, Any]:
         return {
             "effect": self.effect,
+            "family": self.family,
+            "kind": self.kind,
             "joints": [j + 1 for j in self.joints],
             "recordings": list(self.recordings),
             "intervals": None if self.intervals is None else [list(pair) for pair in self.intervals],

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..convention import PLAIN, Convention
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_folder
@@ -20,6 +21,7 @@ def payload_files(
     *,
     frame: str,
     torque_scale_std: float,
+    convention: Convention = PLAIN,
 ) -> PayloadEstimate:
     """`jaxpanda payload`."""
     for flag, paths in (("--without", without), ("--with", loaded)):
@@ -27,7 +29,12 @@ def payload_files(
             raise InputError(f"{flag}: none given; name at least one file or folder")
     with output_folder(out):
         found = estimate_payload(
-            model, load_many(without), load_many(loaded), frame=frame, torque_scale_std=torque_scale_std
+            model,
+            convention.applied(load_many(without), model),
+            convention.applied(load_many(loaded), model),
+            frame=frame,
+            torque_scale_std=torque_scale_std,
+            gravity=convention.mounting,
         )
         if found.written is not None:
             missing = tuple(f"{MODEL_XML}: {what}" for what in missing_assets(found.written, out))

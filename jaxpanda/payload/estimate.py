@@ -21,7 +21,7 @@ from ..errors import InputError, require_x64
 from ..export import panda_mjcf
 from ..identification import statistics
 from ..markup import parse
-from ..mjcf import from_document, from_mjcf
+from ..mjcf import from_document, from_mjcf, with_gravity
 from ..recordings import Recording, distinct
 from .design import CHANGE, SLOW, Design, Sampled, Scales, design, sample
 from .frame import frame_of
@@ -57,6 +57,7 @@ def estimate_payload(
     *,
     frame: str = "",
     torque_scale_std: float = 0.0,
+    gravity: Sequence[float] | None = None,
 ) -> PayloadEstimate:
     """Mass, centre of mass and inertia of the body that the arm carries in some recordings and not in others.
 
@@ -69,6 +70,7 @@ def estimate_payload(
             that is called a flange, else the last link's own body.
         torque_scale_std: relative deviation of a scale that all torques share, as 0.1 where they are motor
             currents times gains known to 10 %. No recording tells it; it widens mass and inertia alike.
+        gravity: in place of the model's, in the frame of its world [m/s²].
 
     Raises:
         InputError: recordings or model that cannot be used, in one sentence.
@@ -81,9 +83,10 @@ def estimate_payload(
     if not 0 <= torque_scale_std < 1:
         raise InputError(f"--torque-scale-std: {torque_scale_std:g}, where a share of 0 to 1 is expected")
     if model is None:
-        arm, source = from_document(parse(panda_mjcf(), "mujoco", Path("panda.xml")))
+        own = parse(panda_mjcf(), "mujoco", Path("panda.xml"))
+        arm, source = from_document(with_gravity(own, gravity))
     else:
-        arm, source = from_mjcf(model)
+        arm, source = from_mjcf(model, gravity)
     place = frame_of(source, frame)
     every = distinct([*without, *loaded])
     samples = [sample(r, arm, k >= len(without)) for k, r in enumerate(every)]

@@ -1,0 +1,169 @@
+"""A torque column that is not joint torque: one finding that says what it is, and no physics sought in it."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .. import files, markup, summaries
+from ..corrected import FILE, XML, Corrected
+from ..export import missing_assets, write_document
+from ..meaning import Meaning, meaning
+from ..mjcf import MjcfSource
+from ..recordings import Recording
+from ..report import Section
+from .finding import Finding, Fit
+from .knowledge import Knowledge
+from .traces import Trace
+
+EQUATIONS = {
+    "gravity_removed": "column = tau - g(q)",
+    "sign": "column = sign * tau",
+    "unit": "column = factor * tau",
+    "current": "column = factor_j * tau",
+    "motor_side": "column = factor_j * tau",
+    "joint_order": "column = tau of another joint",
+    "mounting": "tau = M(q) ddq + c(q, dq) + g(q; gravity)",
+}
+"""What each kind of column holds, by the torque that inverse dynamics gives."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Misread:
+    """Recordings whose torque is not what the model's inverse dynamics gives; fields as of `Diagnosis`."""
+
+    findings: tuple[Finding, ...]
+    fit: Fit
+    """Of the user's model, before and after alike [N m]."""
+    corrected: Corrected
+    """The user's model as it is."""
+    source: MjcfSource = dataclasses.field(repr=False)
+    notes: tuple[str, ...]
+    knowledge: Knowledge
+    verdict: str = "unexplained"
+    """No physics was sought, so that none is explained."""
+    sources: tuple[Mapping[str, str], ...] = ()
+    replays: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def written(self) -> markup.Document:
+        return self.source.document
+
+    @property
+    def corrected_xml(self) -> str:
+        return self.written.text
+
+    def to_json(self) -> dict[str, Any]:
+        """diagnosis.json; null where something takes torque that is understood."""
+        return {
+            "schema": "jaxpanda.diagnosis/1",
+            "verdict": self.verdict,
+            "findings": [f.to_json() for f in self.findings],
+            "fit": self.fit.to_json(),
+            "notes": list(self.notes),
+            "localisation": None,
+            "heat_map": None,
+            "smallest_shown": [],
+            "next_experiment": None,
+            "replays": [],
+            "knowledge": self.knowledge,
+            "sources": [dict(one) for one in self.sources],
+            "log": [],
+        }
+
+    def lines(self) -> list[str]:
+        """Verdict and findings in plain sentences."""
+        first = (
+            "The torque in the recordings is not what inverse dynamics gives: no physics was sought in it."
+        )
+        return [first, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]
+
+    def save(self, folder: str | Path) -> tuple[str, ...]:
+        """Write diagnosis.json, corrected.xml and corrected.json, of the user's model as it is."""
+        folder, document = Path(folder), self.to_json()
+        write_document(self.written, folder / XML)
+        files.write_json(folder / "diagnosis.json", document)
+        noise = [float(v) for v in self.fit.noise_floor]
+        files.write_json(folder / FILE, {**self.corrected.to_json(), "torque_noise": noise})
+        return missing_assets(self.written, folder)
+
+
+def misread(
+    recordings: Sequence[Recording], traces: Sequence[Trace], source: MjcfSource, knowledge: Knowledge
+) -> Misread | None:
+    """What the torque columns are, where that is not joint torque in one of the recordings; else None.
+
+    Args:
+        recordings: those in question.
+        traces: of the same, in the same order.
+        source: the simulation.
+        knowledge: how well its numbers are known; passed on.
+    """
+    arm = traces[0].motion.arm
+    read = [(one.name, meaning(one, arm)) for one in recordings]
+    told = [(name, found) for name, found in read if found is not None]
+    if not told:
+        return None
+    alike: dict[tuple[str, tuple[int, ...]], list[tuple[str, Meaning]]] = {}
+    for name, found in told:
+        alike.setdefault((found.kind, found.joints), []).append((name, found))
+    findings = [_finding([name for name, _ in group], max((m for _, m in group), key=lambda m: m.evidence), arm)
+                for group in alike.values()]  # fmt: skip
+    rms = np.sqrt(np.mean(np.concatenate([t.residual * t.weight[:, None] for t in traces]) ** 2, 0))
+    floors = [t.signals.noise for t in traces if t.signals.noise is not None]
+    floor = np.maximum(np.mean(floors, 0), 1e-9) if floors else np.full(arm.dof, 1e-9)
+    zero = jnp.zeros(arm.dof)
+    others = sorted(name for name, found in read if found is None)
+    notes = [f"torque is joint torque, or cannot be told, in {', '.join(others)}"] if others else []
+    notes.append("corrected.xml and `predict` are your model as it is: mend the torque column first")
+    return Misread(
+        findings=tuple(sorted(findings, key=lambda f: -f.evidence)),
+        fit=Fit(rms, rms, rms, rms, floor),
+        corrected=Corrected(arm, jnp.zeros((arm.dof, 10)), zero, zero, (), ()),
+        source=source,
+        notes=tuple(notes),
+        knowledge=knowledge,
+    )
+
+
+def _finding(names: Sequence[str], found: Meaning, arm: Any) -> Finding:
+    """A meaning as a finding."""
+    parameters: list[dict[str, Any]] = []
+    if found.gravity is not None:
+        parameters = [
+            {"name": f"gravity_{axis}", "joint": None, "value": value, "std": None, "unit": "m/s²"}
+            for axis, value in zip("xyz", found.gravity, strict=True)
+        ]
+    elif found.kind == "joint_order":
+        parameters = [
+            {"name": "joint_of_column", "joint": c + 1, "value": float(j + 1), "std": None, "unit": ""}
+            for c, j in enumerate(found.order)
+        ]
+    elif found.kind != "gravity_removed":
+        parameters = [
+            {"name": "factor", "joint": j + 1, "value": found.factors[j], "std": None, "unit": ""}
+            for j in found.joints
+        ]
+    return Finding(
+        effect="torque_meaning",
+        joints=found.joints,
+        recordings=tuple(names),
+        intervals=None,
+        confidence=found.confidence,
+        alternatives=(),
+        equation=EQUATIONS[found.kind],
+        parameters=tuple(parameters),
+        rms_torque=np.asarray(found.rms),
+        evidence=found.evidence,
+        summary=f"In {', '.join(names)}: {found.summary}",
+        terms=(),
+        kind=found.kind,
+    )
+
+
+def sections(found: Misread) -> list[Section]:
+    """The page."""
+    return [*summaries.diagnosis(found), Section("Your file", ["corrected.xml is your file as it was."])]
