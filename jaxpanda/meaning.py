@@ -58,8 +58,9 @@ _MEMORIES = np.array([0.05, 0.2, 0.8])
 """Correlation times of the error [s]."""
 _SIZES = np.exp(np.arange(np.log(1e-6), np.log(2e4), 0.5))
 """Sizes of the error, in the size of the joint's torque; the least are none, lest a factor stand in for them."""
-_SHARES = np.array([0.03, 0.1, 0.3, 1.0])
-"""Shares of the deviations below that a joint may have: most models are better than the worst."""
+_SHARES = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+"""Shares of the deviations below that a joint may have. Most models are better than that, and some are far worse:
+without the last two a factor would be told for a model that is wrong, as it makes its deviations larger."""
 _WHITE = 0.03
 """Share of the error's variance that is not correlated."""
 _LINKS = 0.2, 0.02, 0.3
@@ -380,7 +381,7 @@ class _Model:
             r, total = turned @ (column - self.torque[:, j]), _totals(variances, self.size[j])
             said.append(-0.5 * (r**2 @ (1 / total) + np.sum(np.log(total), 0) + determinant))
         share, size = divmod(int(np.argmax(said)) % (len(_SHARES) * len(_SIZES)), len(_SIZES))
-        return bool(share == len(_SHARES) - 1 or _SIZES[size] * self.size[j] > _OFF * np.std(column))
+        return bool(_SHARES[share] >= 1 or _SIZES[size] * self.size[j] > _OFF * np.std(column))
 
 
 def _parts(models: Sequence[_Model]) -> list[tuple[np.ndarray, np.ndarray]]:

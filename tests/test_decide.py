@@ -298,7 +298,9 @@ def test_what_each_recording_shows_otherwise_is_not_explained():
     found = diagnose(None, [record(30, day(1)), record(31, day(-1))], knowledge="exact")
     assert any("predicted no better" in note for note in found.notes)
     assert found.verdict in ("partly_explained", "unexplained")
-    assert all(f.confidence <= 0.3 for f in found.findings if f.effect != "unknown")
+    named = [f for f in found.findings if f.effect != "unknown"]
+    assert all(f.posterior is not None and f.posterior <= MISLEADS + 1e-9 for f in named)
+    assert all(f.confidence < 0.4 for f in named)  # such claims turned out right in 6 trials of 16
 
 
 def test_what_acts_along_a_joint_that_slides_is_told_in_newtons_and_metres():
