@@ -12,6 +12,7 @@ import itertools
 import numpy as np
 import scipy.interpolate
 import scipy.ndimage
+import scipy.signal
 from jaxtyping import Float
 
 from .. import signals as signals_
@@ -26,7 +27,11 @@ FINE_RATE = 1000.0
 """Rate of the fine grid, at most [Hz]."""
 POSITION_CUTOFF = 12.0
 """Low-pass of q before it is differentiated, at most [Hz]."""
-_LEAST_CUTOFF = 5.0
+_LEAST_CUTOFF, _LEAST_WHOLE = 5.0, 2.5
+"""The least low-pass of q for a diagnosis, and for a prediction [Hz]."""
+_WINDOW, _TOP, _SMOOTH = 4.0, 0.35, 3.0
+"""For the spectrum of the acceleration: a stretch [s], the share of the rate above which it is noise, and a
+low-pass by which a motion is smooth [Hz]."""
 TRIM = 0.4
 """Left out at both ends of a recording [s]."""
 _REST = 5.0
@@ -172,7 +177,10 @@ def prepare(
     )
     if noise is None and rough.tau is not None:
         noise = signals_.white_noise(rough.tau)
-    cutoff_q = position_cutoff(position, noise, arm, rate)
+    if whole:
+        cutoff_q = _clearest_cutoff(position, _steps(recording.q), noise, arm, rate)
+    else:
+        cutoff_q = position_cutoff(position, noise, arm, rate)
     q, qd, qdd = _derivatives(position, cutoff_q, rate)
     width = _REST * _velocity_noise(_position_noise(position), cutoff_q, rate)
 
@@ -340,6 +348,47 @@ def position_cutoff(
     M = np.diag(masses(arm, q.mean(0)[None])[0])
     crossing = np.sqrt(noise / np.maximum(np.abs(M) * _position_noise(q), 1e-12)) / (2 * np.pi)
     return float(np.clip(1.3 * crossing.min(), min(_LEAST_CUTOFF, most), most))
+
+
+def _clearest_cutoff(
+    q: Float[np.ndarray, "time dof"],
+    step: Float[np.ndarray, " dof"],
+    noise: Float[np.ndarray, " dof"] | None,
+    arm: Arm,
+    rate: float,
+) -> float:
+    r"""Where a low-pass leaves least of both in the torque: noise of $\ddot q$ below it, motion above it [Hz].
+
+    A diagnosis can weigh down samples whose motion the filter takes away; a prediction has to have them. Power
+    of $\ddot q$ less that of q's noise is the motion's; joints count by $(M_{jj}/\sigma_{\tau,j})^2$. The noise
+    is white, or that of a smooth motion written in steps.
+    """
+    M = np.diag(masses(arm, q.mean(0)[None])[0])
+
+    def spectrum(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        window = min(len(x) - 2, round(_WINDOW * rate))
+        return scipy.signal.welch(np.diff(x, n=2, axis=0) * rate**2, rate, nperseg=window, axis=0)
+
+    f, power = spectrum(q)
+    smooth = signals_.zero_phase(q, _SMOOTH, rate)
+    written = np.maximum(step, 1e-12)
+    _, rounding = spectrum(q[0] + np.round((smooth - q[0]) / written) * written - smooth)
+    twice = ((2 * rate * np.sin(np.pi * f / rate)) ** 4)[:, None]
+    top = f > _TOP * rate
+    white = np.median(power[top] / twice[top], 0)
+    shaken = np.maximum(white * twice, rounding)
+    moved = np.maximum(power - shaken, 0.0)
+    left = np.cumsum(shaken, 0) + moved.sum(0) - np.cumsum(moved, 0)
+    unit = M if noise is None else M / np.maximum(noise, 1e-12)
+    best = f[np.argmin(left @ unit**2)]
+    return float(np.clip(best, min(_LEAST_WHOLE, 0.25 * rate), 0.25 * rate))
+
+
+def _steps(recorded: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
+    """What q is written in [rad]: the least difference between two rows; 0 of a joint that stands."""
+    steps = np.abs(np.diff(recorded, axis=0))
+    least = np.min(np.where(steps > 0, steps, np.inf), axis=0, initial=np.inf)
+    return np.where(np.isfinite(least), least, 0.0)
 
 
 def _position_noise(q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof"]:
