@@ -73,6 +73,34 @@ def test_shaken_columns_are_the_inertial_torque_of_fast_accelerations():
     assert np.sqrt(np.mean(difference**2)) < 0.15 * np.sqrt(np.mean(expected[inner] ** 2))
 
 
+def test_a_prediction_keeps_motion_that_is_fast_but_above_the_noise_of_q():
+    """A diagnosis weighs such samples down; a prediction has to have their torque."""
+    t = np.arange(int(8 * RATE)) / RATE
+    one = moved(0.5 * np.sin(2 * np.pi * 0.3 * t) + 2e-3 * np.sin(2 * np.pi * 9.0 * t))
+    noisy = dataclasses.replace(one, q=one.q + 5e-5 * np.random.default_rng(1).normal(size=one.q.shape))
+    fast = -2e-3 * (2 * np.pi * 9.0) ** 2 * np.sin(2 * np.pi * 9.0 * t)
+    slow = -0.5 * (2 * np.pi * 0.3) ** 2 * np.sin(2 * np.pi * 0.3 * t)
+    qdd = predicted_acceleration(noisy)
+    error = (qdd - (slow + fast)[:, None])[100:-100]
+    assert np.sqrt(np.mean(error**2)) < 0.6 * np.std(fast)  # 0.99 with the filter of a diagnosis
+
+
+def test_a_prediction_is_not_shaken_by_a_coarse_encoder():
+    """Also where each joint stands most of the time, so that its noise is not seen."""
+    t = np.arange(int(24 * RATE)) / RATE
+    turns = (np.floor(t / 3)[:, None] == np.arange(7)) * 0.3 * np.sin(2 * np.pi * t / 3)[:, None] ** 3
+    q = 0.5 * np.asarray(Arm.panda().lower + Arm.panda().upper) + turns
+    written = dataclasses.replace(moved(0 * t), q=np.round(q / 1.5e-3) * 1.5e-3)
+    error = predicted_acceleration(written) - predicted_acceleration(dataclasses.replace(written, q=q))
+    assert np.sqrt(np.mean(error**2)) < 0.03  # 0.07 with the filter of a diagnosis
+
+
+def predicted_acceleration(recording: Recording) -> np.ndarray:
+    """On the recording's own times [rad/s²]."""
+    trace = prepare(recording, Arm.panda(), whole=True)
+    return np.stack([np.interp(recording.time, trace.motion.time, x) for x in trace.motion.qdd.T], 1)
+
+
 def test_friction_that_gear_teeth_carry_is_load_dependent_and_directed():
     r"""$F = \mu |\tau + F \operatorname{sign} \dot q|$, solved exactly."""
     rng, mu = np.random.default_rng(0), 0.15
