@@ -58,13 +58,13 @@ _FEWEST = 30
 """Samples from which a recording is judged."""
 _STILL = 0.02
 """Travel below which a joint is not judged [rad]: friction at rest may carry its load."""
-_MEMORIES = np.array([0.05, 0.2, 0.8])
+_MEMORIES = np.array([0.05, 0.2, 0.8, 3.2])
 """Correlation times of the error [s]."""
 _SIZES = np.exp(np.arange(np.log(1e-6), np.log(2e4), 0.5))
 """Sizes of the error, in the size of the joint's torque; the least are none, lest a factor stand in for them."""
-_SHARES = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
-"""Shares of the deviations below that a joint may have. Most models are better than that, and some are far worse:
-without the last two a factor would be told for a model that is wrong, as it makes its deviations larger."""
+_SHARES = np.geomspace(0.03, 8.0, 8)
+"""Shares of the deviations below that a joint may have. Most models are better than that, and some are far worse: a
+factor would be told for these, as it makes the deviations larger."""
 _WHITE = 0.03
 """Share of the error's variance that is not correlated."""
 _LINKS = 0.2, 0.02, 0.3
@@ -75,6 +75,8 @@ _GAIN, _TILT, _DELAY = 0.25, 0.1, 0.05
 """Deviations of a sensor's gain, as a share; of a base that is not level [rad]; of a delay [s]."""
 _FREE = 1.0
 """Deviation of friction of each kind, offset, rotor inertia and spring, in the size of the joint's torque."""
+_RESTS = 0.02
+"""Velocity below which dry friction may hold any load [rad/s]."""
 _OFF = 0.5
 """Share of a column that the model's torque leaves, at least, where the column is another joint's."""
 _SMALL = 0.1
@@ -329,6 +331,7 @@ class _Model:
             unit(self.q[:, j] - self.q[:, j].mean()),
         ]
         slow = np.gradient(self.torque[:, j], self.samples.time)
+        at_rest = np.diag(_FREE * size * np.exp(-0.5 * (qd / _RESTS) ** 2))
         g = float(np.linalg.norm(self.gravity))
         tilt = self.weight[:, j] @ _across(self.gravity) * (g * _TILT) if g > 0 else np.zeros((len(qd), 0))
         return np.column_stack(
@@ -338,6 +341,7 @@ class _Model:
                 _GAIN * self.torque[:, j],
                 _DELAY * slow,
                 tilt,
+                at_rest[:, np.abs(qd) < 4 * _RESTS],
             ]
         )
 
@@ -398,6 +402,12 @@ class _Model:
         for j in self.moving:
             said[j] = self.joint_evidence(j, self.tau[:, j], self.torque[:, j], both)
         return said[:, : len(_FACTORS)], said[:, len(_FACTORS) :]
+
+    @functools.cached_property
+    def ratio(self) -> Float[np.ndarray, " dof"]:
+        """Size of each joint's column over that of the model's torque, rms."""
+        rms = [np.sqrt(np.mean(x**2, 0)) for x in (self.tau, self.torque)]
+        return rms[0] / np.maximum(rms[1], 1e-12)
 
     @functools.cached_property
     def left(self) -> Float[np.ndarray, " dof"]:
@@ -522,7 +532,9 @@ def _scales(model: _Model) -> list[_Reading]:
     one = int(np.argmin(np.abs(logs)))
     factors, score, count = np.ones(dof), np.log(_PRIOR), 0
     for j in moving:
-        alone = np.where(single, plus[j], -np.inf)  # other numbers are likelier to be something else there
+        # other numbers are likelier to be something else there, as is one that makes torque far too small
+        may_be = single & (logs < 2 * np.log(max(model.ratio[j], 1e-12)))
+        alone = np.where(may_be, plus[j], -1e9)
         gain = _logsumexp(alone) - plus[j, one] - np.log(dof * single.sum())
         if gain > 2 * _EACH:
             k = float(np.exp(logs[np.argmax(alone)]))

@@ -428,12 +428,9 @@ def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) ->
         effects.append(term.effect)
         values.append(jnp.asarray(x[at : at + len(term.deviation)] * term.deviation))
         at += len(term.deviation)
-    recorded = max(
-        float(t.motion.time[-1]) for t, on in zip(problem.traces, problem.active, strict=True) if on
-    )
+    recorded = [t.channels for t, on in zip(problem.traces, problem.active, strict=True) if on]
     for i, term in enumerate(state.terms):
-        known = {"until": recorded} if term.effect.drifts else {}
-        effects.append(dataclasses.replace(term.effect, **known))
+        effects.append(term.effect.beyond(recorded))
         values.append(jnp.asarray(coefficients(state, i)))
     return Corrected(
         arm, jnp.asarray(change), jnp.asarray(damping), jnp.asarray(level), tuple(effects), tuple(values)

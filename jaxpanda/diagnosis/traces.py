@@ -29,13 +29,18 @@ POSITION_CUTOFF = 12.0
 """Low-pass of q before it is differentiated, at most [Hz]."""
 _LEAST_CUTOFF, _LEAST_WHOLE = 5.0, 2.5
 """The least low-pass of q for a diagnosis, and for a prediction [Hz]."""
-_WINDOW, _TOP, _SMOOTH = 4.0, 0.35, 3.0
-"""For the spectrum of the acceleration: a stretch [s], the share of the rate above which it is noise, and a
-low-pass by which a motion is smooth [Hz]."""
+_WINDOW, _SMOOTH = 4.0, 3.0
+"""For the spectrum of the acceleration: a stretch [s], and a low-pass by which a motion is smooth [Hz]."""
+_BANDS, _COUNTS = ((0.15, 0.25), (0.25, 0.35), (0.35, 0.5)), 4.0
+"""Shares of the rate between which noise of q is told; and how often it counts against motion, as filled gaps and
+other joints' inertia put more of it into the torque."""
 TRIM = 0.4
 """Left out at both ends of a recording [s]."""
 _REST = 5.0
 """Noise of the velocity within which a joint counts as at rest, in standard deviations."""
+_HELD = 0.01
+"""Travel of a joint that friction may hold all the time, yielding both ways [rad]: bristles of real gears give
+way by 2 to 4 mrad before they break away."""
 _GAP, _NEAR = 3.5, 0.12
 """Missing steps that make a gap, and how far beyond it samples do not count [s]."""
 _TURN = 0.01
@@ -217,7 +222,7 @@ def prepare(
         unsure = np.hypot(unsure, (np.abs(motion.mass) @ cut_off[:, :, None])[:, :, 0])
         trust = 1 / np.sqrt(1 + (unsure / np.maximum(noise, 1e-12)) ** 2)
         if not whole:
-            trust[:, np.ptp(motion.q, axis=0) < signals_.STILL] = 0.0
+            trust[:, np.ptp(motion.q, axis=0) < _HELD] = 0.0
     stuck = ()
     if recording.tau is not None and noise is not None and not whole:
         stuck = _stuck(recording.time, recording.tau, motion, noise)
@@ -374,11 +379,13 @@ def _clearest_cutoff(
     written = np.maximum(step, 1e-12)
     _, rounding = spectrum(q[0] + np.round((smooth - q[0]) / written) * written - smooth)
     twice = ((2 * rate * np.sin(np.pi * f / rate)) ** 4)[:, None]
-    top = f > _TOP * rate
-    white = np.median(power[top] / twice[top], 0)
+    levels = power[1:] / twice[1:]
+    white = np.max(
+        [np.median(levels[(f[1:] > low * rate) & (f[1:] <= high * rate)], 0) for low, high in _BANDS], 0
+    )
     shaken = np.maximum(white * twice, rounding)
     moved = np.maximum(power - shaken, 0.0)
-    left = np.cumsum(shaken, 0) + moved.sum(0) - np.cumsum(moved, 0)
+    left = np.cumsum(_COUNTS * shaken, 0) + moved.sum(0) - np.cumsum(moved, 0)
     unit = M if noise is None else M / np.maximum(noise, 1e-12)
     best = f[np.argmin(left @ unit**2)]
     return float(np.clip(best, min(_LEAST_WHOLE, 0.25 * rate), 0.25 * rate))

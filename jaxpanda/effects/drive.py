@@ -68,9 +68,10 @@ class JointSpring(AbstractInstantEffect):
     Form "cubic" adds $k_2 x^2 + k_3 x^3$: a spring that stiffens away from where it rests. There $x = q - $
     `around`, which changes no torque: about zero a joint that moves far from it would need coefficients that
     cancel, and no prior has those. Form "linear" takes x for q where it comes from a cubic one, so that only what
-    stiffens is weighed. Form "centred" is without b. Form "slack" pulls on one side of where it gets taut, or
-    harder there than on the other: $\tau_j = k_+ w s(x/w) - k_- w s(-x/w) + b$ with $s(y) = \log(1 + e^y)$ and
-    the width w over which it tightens.
+    stiffens is weighed. A cubic grows without bounds, so that its torque stays what it is at the ends of what was
+    recorded, `low` and `high` [rad]. Form "centred" is without b. Form "slack" pulls on one side of where it gets
+    taut, or harder there than on the other: $\tau_j = k_+ w s(x/w) - k_- w s(-x/w) + b$ with
+    $s(y) = \log(1 + e^y)$ and the width w over which it tightens.
     """
 
     name: ClassVar[str] = "joint_spring"
@@ -82,6 +83,8 @@ class JointSpring(AbstractInstantEffect):
     form: str = eqx.field(static=True)
     around: Float[Array, ""] | float = 0.0
     width: Float[Array, ""] | float = 0.05
+    low: float = -1e9
+    high: float = 1e9
 
     @property
     def shapes(self) -> tuple[Shape, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -119,6 +122,12 @@ class JointSpring(AbstractInstantEffect):
             ),
         }[self.form]
 
+    def beyond(self, recorded: Sequence[Channels]) -> "JointSpring":
+        if self.form != "cubic":
+            return self
+        q = np.concatenate([np.asarray(s.q)[:, int(self.joint)] for s in recorded])
+        return dataclasses.replace(self, low=float(q.min()), high=float(q.max()))
+
     @property
     def form_prior(self) -> float:
         """One spring in twenty stiffens or gets slack where the joint moves."""
@@ -150,7 +159,7 @@ class JointSpring(AbstractInstantEffect):
         return super().parameters(about_zero @ c, about_zero @ covariance @ about_zero.T)
 
     def at(self, s: Channels) -> Float[Array, " n"]:
-        q = s.q[self.joint]
+        q = jnp.clip(s.q[self.joint], self.low, self.high)
         x, one = q - self.around, jnp.ones_like(q)
         if self.form == "slack":
             pulled = [side * self.width * jax.nn.softplus(side * x / self.width) for side in (1.0, -1.0)]

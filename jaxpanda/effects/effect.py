@@ -95,8 +95,7 @@ class AbstractEffect(eqx.Module):
     takes_shown: ClassVar[bool] = False
     """Whether it is a function of torque that the sensors show, and so of every other effect."""
     drifts: ClassVar[bool] = False
-    """Whether it changes with the clock; then its field `until` is the end of what was recorded [s], after which
-    nobody knows how it goes on."""
+    """Whether it changes with the clock; nobody knows how it goes on after what was recorded (`beyond`)."""
     bound_to_recording: ClassVar[bool] = False
     """Whether it happened at some time in a recording; `placed` says what that means for others."""
 
@@ -119,6 +118,10 @@ class AbstractEffect(eqx.Module):
     @abc.abstractmethod
     def equation(self) -> str:
         """Readable equation in the symbols of the parameters."""
+
+    def beyond(self, recorded: Sequence[Channels]) -> "AbstractEffect":
+        """The same where it was recorded, and as it may go on beyond that."""
+        return self
 
     @property
     def plainer(self) -> tuple["AbstractEffect", ...]:

@@ -390,6 +390,9 @@ class FrictionDrift(AbstractDryFriction):
             for j in range(arm.dof)
         ]
 
+    def beyond(self, recorded: Sequence[Channels]) -> "FrictionDrift":
+        return dataclasses.replace(self, until=max(float(s.t[-1]) for s in recorded))
+
     @property
     def steady(self) -> tuple[AbstractDryFriction | ViscousFriction, ...]:
         """The friction that does not change."""

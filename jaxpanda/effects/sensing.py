@@ -116,6 +116,9 @@ class TorqueDrift(AbstractInstantEffect):
         shapes += [(form, T) for form in ("wave", "wandering") for T in (6.0, 10.0, 16.0, 30.0, 60.0)]
         return [cls(j, T, form) for form, T in shapes for j in range(arm.dof)]
 
+    def beyond(self, recorded: Sequence[Channels]) -> "TorqueDrift":
+        return dataclasses.replace(self, until=max(float(s.t[-1]) for s in recorded))
+
     @property
     def steady(self) -> tuple[TorqueOffset, ...]:
         """The bias that does not change."""
