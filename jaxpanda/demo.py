@@ -21,6 +21,7 @@ from .inspection import inspect
 from .mjcf import from_mjcf, standard_from_com
 from .panda import published
 from .pipeline import arm_of, beyond_mjcf, recordings_of, to_mjcf
+from .reading import Reading
 from .recordings import Recording, save
 from .report import Section, number
 from .retrieval import Retrieval, retrieve
@@ -86,6 +87,7 @@ def demonstrate(
     model: Path | None = None,
     starts: int = 2048,
     seed: int = 0,
+    reading: Reading | None = None,
 ) -> Demonstration:
     """Record (virtually, unless recordings are given), identify, retrieve, export, validate, report.
 
@@ -95,6 +97,7 @@ def demonstrate(
         model: the user's MJCF; the project's Panda without it.
         starts: random starts of the retrieval.
         seed: of the virtual arm and of the starts.
+        reading: which topic, episode, columns and times of the recordings are meant.
 
     Raises:
         InputError: as the stages do; nothing is left in `out` then.
@@ -105,7 +108,7 @@ def demonstrate(
     with output_folder(out) as folder:
         if recordings:
             virtual = None
-            training = recordings_of(recordings, arm)
+            training = recordings_of(recordings, arm, reading)
             testing = training
         else:
             with progress("recording a virtual arm"):

@@ -19,7 +19,8 @@ from .identification import Identification, identify, identify_mass_gravity
 from .inspection import Inspection, inspect
 from .lint import lint
 from .mjcf import from_document, from_mjcf
-from .recordings import Recording, distinct, load_many
+from .reading import Reading
+from .recordings import Recording, distinct, load, load_many, save
 from .retrieval import CHECKPOINT_FILE, Retrieval, retrieve
 from .session import progress, telling
 from .urdf import left_out, to_urdf
@@ -31,11 +32,13 @@ def arm_of(model: Path | None) -> Arm:
     return Arm.panda() if model is None else Arm.from_mjcf(model)
 
 
-def recordings_of(paths: Sequence[Path], arm: Arm | None = None) -> list[Recording]:
+def recordings_of(
+    paths: Sequence[Path], arm: Arm | None = None, reading: Reading | None = None
+) -> list[Recording]:
     """Read recordings, and make sure that they are of this arm."""
     if not paths:
         raise InputError("--recording: none given; name at least one file or folder")
-    recordings = distinct(load_many(paths))
+    recordings = distinct(load_many(paths, reading))
     for recording in recordings:
         if arm is not None:
             recording.require_dof(arm.dof)
@@ -52,13 +55,43 @@ class Inspections:
         return {"schema": "jaxpanda.inspections/1", "recordings": [one.to_json() for one in self.recordings]}
 
 
-def inspect_files(paths: Sequence[Path], model: Path | None) -> Inspections:
+def inspect_files(paths: Sequence[Path], model: Path | None, reading: Reading | None = None) -> Inspections:
     """`jaxpanda inspect`."""
-    recordings = recordings_of(paths)
+    recordings = recordings_of(paths, reading=reading)
     if model is None and any(recording.dof != Arm.panda().dof for recording in recordings):
         return Inspections(tuple(inspect(recording) for recording in recordings))
     arm = arm_of(model)
     return Inspections(tuple(inspect(recording, arm) for recording in recordings))
+
+
+@dataclasses.dataclass(frozen=True)
+class Conversion:
+    """What was read of a log and written."""
+
+    recording: Recording
+    path: Path
+
+    def to_json(self) -> dict[str, Any]:
+        origin = self.recording.origin
+        return {
+            "schema": "jaxpanda.conversion/1",
+            "path": str(self.path),
+            "samples": self.recording.samples,
+            "joints": self.recording.dof,
+            "origin": None if origin is None else origin.to_json(),
+            "repairs": dict(self.recording.repairs),
+            "notes": list(self.recording.notes),
+        }
+
+
+def convert_file(file: Path, out: Path, reading: Reading) -> Conversion:
+    """`jaxpanda convert`: the recording of a log, as a file that reads back to the same numbers."""
+    log, end = file.resolve(), out.resolve()
+    if end == log or log in end.parents or (out.exists() and file.exists() and out.samefile(file)):
+        raise InputError(f"--out {out}: is the log itself or lies in it; choose another place")
+    recording = load(file, reading=reading)
+    save(recording, out)
+    return Conversion(recording, out)
 
 
 def identify_files(
@@ -72,6 +105,7 @@ def identify_files(
     weighting: str,
     cutoff: float,
     folds: int,
+    reading: Reading | None = None,
 ) -> Identification:
     """`jaxpanda identify`."""
     if (mass_gravity is None) == (not recordings):
@@ -83,7 +117,7 @@ def identify_files(
         else:
             with progress("identifying") as tick:
                 found = identify(
-                    recordings_of(recordings, arm),
+                    recordings_of(recordings, arm, reading),
                     arm,
                     method=method,
                     friction=friction,
@@ -209,14 +243,21 @@ def _identified_file(links: Retrieval) -> Path | None:
 
 
 def validate_files(
-    out: Path, model: Path, recordings: Sequence[Path], *, cutoff: float, in_mjx: bool = True
+    out: Path,
+    model: Path,
+    recordings: Sequence[Path],
+    *,
+    cutoff: float,
+    in_mjx: bool = True,
+    reading: Reading | None = None,
 ) -> Validation:
     """`jaxpanda validate`: with the offset in an exported file's sidecar, and what the lint has to say."""
     engines = "MuJoCo and MJX; MJX takes most of the time, --no-mjx leaves it out" if in_mjx else "MuJoCo"
     with output_folder(out) as folder, telling("validating") as say:
         say(f"comparing inverse dynamics, torque and a roll-out in {engines}")
         friction, beside = beyond_mjcf(model)
-        checked = validate(model, recordings_of(recordings), cutoff=cutoff, in_mjx=in_mjx, friction=friction)
+        logs = recordings_of(recordings, reading=reading)
+        checked = validate(model, logs, cutoff=cutoff, in_mjx=in_mjx, friction=friction)
         slips = tuple(f"{slip.severity}: {slip.where}: {slip.message}" for slip in lint(model))
         checked = dataclasses.replace(checked, notes=(*checked.notes, *beside, *slips))
         checked.save(folder)

@@ -15,6 +15,7 @@ from ..corrected import XML, read
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_folder, write_text
+from ..reading import Reading
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
 from ..session import telling
@@ -59,6 +60,7 @@ def diagnose_files(
     recordings: Sequence[Path],
     reference: Sequence[Path],
     knowledge: Knowledge,
+    reading: Reading | None = None,
 ) -> Diagnosis | resting.AtRest:
     """`jaxpanda diagnose`."""
     if not recordings:
@@ -66,7 +68,7 @@ def diagnose_files(
     with output_folder(out) as folder, telling("diagnosing") as say:
         count = len(recordings) + len(reference)
         say(f"reading {count} recording{'s' * (count != 1)}")
-        suspect, healthy = load_many(recordings), load_many(reference)
+        suspect, healthy = load_many(recordings, reading), load_many(reference, reading)
         every = distinct([*suspect, *healthy])
         suspect, healthy = every[: len(suspect)], every[len(suspect) :]
         found = diagnose(
@@ -136,9 +138,9 @@ def _source(role: str, path: Path, names: Mapping[Path | None, str]) -> dict[str
     return {"role": role, "name": name, "sha256": digest.hexdigest()}
 
 
-def predict_files(diagnosis: Path, recording: Path, out: Path) -> Prediction:
+def predict_files(diagnosis: Path, recording: Path, out: Path, reading: Reading | None = None) -> Prediction:
     """`jaxpanda predict`: torque, and where the motion has torque recorded, how far it is off."""
-    motion = load(recording)
+    motion = load(recording, reading=reading)
     arm = read(diagnosis)[0].arm
     tau = predict(diagnosis, motion)
     head = ",".join(["time", *(f"tau_{j + 1}" for j in range(tau.shape[1]))])

@@ -7,6 +7,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_folder
+from ..reading import Reading
 from ..recordings import load_many
 from .estimate import estimate_payload
 from .result import MODEL_XML, PayloadEstimate
@@ -20,6 +21,7 @@ def payload_files(
     *,
     frame: str,
     torque_scale_std: float,
+    reading: Reading | None = None,
 ) -> PayloadEstimate:
     """`jaxpanda payload`."""
     for flag, paths in (("--without", without), ("--with", loaded)):
@@ -27,7 +29,11 @@ def payload_files(
             raise InputError(f"{flag}: none given; name at least one file or folder")
     with output_folder(out):
         found = estimate_payload(
-            model, load_many(without), load_many(loaded), frame=frame, torque_scale_std=torque_scale_std
+            model,
+            load_many(without, reading),
+            load_many(loaded, reading),
+            frame=frame,
+            torque_scale_std=torque_scale_std,
         )
         if found.written is not None:
             missing = tuple(f"{MODEL_XML}: {what}" for what in missing_assets(found.written, out))
