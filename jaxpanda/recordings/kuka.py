@@ -1,8 +1,8 @@
 """What KUKA's Sunrise controller calls the columns of the logs that its DataRecorder writes beside FRI.
 
-Blanks between cells, a header after `%`; time in two columns, whole seconds and nanoseconds. Positions are in the
-unit that the recorder was given, radians unless told. Time and `axisQMsr` are as public logs have them; no public log
-with torque was at hand, and `axisTauMsr` goes by the same rule.
+Blanks between cells, a header after `%`; time in two columns, whole seconds and nanoseconds. Positions are in
+the unit that the recorder was given, radians unless told. Time and `axisQMsr` are as public logs have them; no
+public log with torque was at hand, and `axisTauMsr` goes by the same rule.
 """
 
 from .table import MEASURED, Source
