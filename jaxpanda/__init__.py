@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .inspection import inspect as inspect
     from .payload import estimate_payload as estimate_payload
     from .pipeline import to_mjcf as to_mjcf
+    from .reading import Reading as Reading
     from .recordings import Recording as Recording
     from .recordings import load as load
     from .recordings import save as save
@@ -46,6 +47,7 @@ _HOME = {
     "Diagnosis": "diagnosis",
     "Identification": "identification",
     "InputError": "errors",
+    "Reading": "reading",
     "Recording": "recordings",
     "Retrieval": "retrieval",
     "demonstrate": "demo",

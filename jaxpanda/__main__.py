@@ -13,6 +13,7 @@ import re
 import shutil
 import sys
 import textwrap
+import typing
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,13 +22,16 @@ import tyro
 
 from .convention import PLAIN, Convention
 from .errors import InputError
-
-_Convention = Annotated[Convention, tyro.conf.arg(name="")]
-"""Options of every command that reads recordings with torque."""
+from .reading import Reading
 
 # Before numpy is imported: its matrices are small here, and threads on them cost more than they save (a
 # diagnosis takes half the time without).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+_Read = Annotated[Reading, tyro.conf.arg(name="")]
+_Convention = Annotated[Convention, tyro.conf.arg(name="")]
+"""Options of every command that reads recordings: which part of a log is read, then what its columns mean."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,12 +41,14 @@ class Demo:
     out: Path
     """Folder for panda.xml, report.html and what the other commands leave."""
     recording: tuple[Path, ...] = ()
-    """Recordings (CSV, .npz, .parquet or a folder of raw logs); without any, a virtual Panda is recorded."""
+    """Recordings (any log that docs/files.md lists); without any, a virtual Panda is recorded."""
     model: Path | None = None
     """The simulation as you have it (MJCF); without it, the project's own Panda."""
     starts: int = 2048
     """Random starts of the retrieval."""
     seed: int = 0
+    read: _Read = dataclasses.field(default_factory=Reading)
+    convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -50,7 +56,13 @@ class Demo:
         from .demo import demonstrate
 
         return demonstrate(
-            self.out, recordings=self.recording, model=self.model, starts=self.starts, seed=self.seed
+            self.out,
+            recordings=self.recording,
+            model=self.model,
+            starts=self.starts,
+            seed=self.seed,
+            reading=self.read,
+            convention=self.convention,
         )
 
 
@@ -62,6 +74,7 @@ class Inspect:
     """Recordings to look at."""
     model: Path | None = None
     """The arm (MJCF); without it, the project's own Panda."""
+    read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
@@ -69,7 +82,7 @@ class Inspect:
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.inspect_files(self.recording, self.model, self.convention)
+        return pipeline.inspect_files(self.recording, self.model, self.read, self.convention)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +108,7 @@ class Identify:
     """Of the zero-phase low-pass on regressor and torque alike [Hz]."""
     folds: int = 5
     """Of the phase-blocked cross-validation."""
+    read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
@@ -112,6 +126,7 @@ class Identify:
             weighting=self.weighting,
             cutoff=self.cutoff,
             folds=self.folds,
+            reading=self.read,
             convention=self.convention,
         )
 
@@ -191,6 +206,7 @@ class Validate:
     """Of the zero-phase low-pass on both torques [Hz]."""
     no_mjx: bool = False
     """Leave MJX out, which takes most of the time on a CPU; roll-outs are then C MuJoCo's alone."""
+    read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
@@ -204,6 +220,7 @@ class Validate:
             self.recording,
             cutoff=self.cutoff,
             in_mjx=not self.no_mjx,
+            reading=self.read,
             convention=self.convention,
         )
 
@@ -222,6 +239,7 @@ class Diagnose:
     """Recordings of the same arm from when nothing was wrong."""
     knowledge: Literal["exact", "identified", "rough", "unknown"] = "identified"
     """How well the numbers in the model are known."""
+    read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
@@ -230,7 +248,13 @@ class Diagnose:
         from . import diagnosis
 
         return diagnosis.diagnose_files(
-            self.out, self.model, self.recording, self.reference, self.knowledge, self.convention
+            self.out,
+            self.model,
+            self.recording,
+            self.reference,
+            self.knowledge,
+            reading=self.read,
+            convention=self.convention,
         )
 
 
@@ -244,13 +268,17 @@ class Predict:
     """The motion: a recording, with or without torque."""
     out: Path
     """The CSV to write."""
+    read: _Read = dataclasses.field(default_factory=Reading)
+    convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
         from . import diagnosis
 
-        return diagnosis.predict_files(self.diagnosis, self.recording, self.out)
+        return diagnosis.predict_files(
+            self.diagnosis, self.recording, self.out, reading=self.read, convention=self.convention
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,6 +298,7 @@ class Payload:
     called a flange, else the last link's body."""
     torque_scale_std: float = 0.0
     """By which share all torques may be off together, as 0.1 for motor currents times gains known to 10 %."""
+    read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
@@ -284,11 +313,31 @@ class Payload:
             self.with_,
             frame=self.frame,
             torque_scale_std=self.torque_scale_std,
+            reading=self.read,
             convention=self.convention,
         )
 
 
-_COMMANDS = (Demo, Inspect, Identify, Retrieve, Export, Validate, Diagnose, Predict, Payload)
+@dataclasses.dataclass(frozen=True)
+class Convert:
+    """Write a log of any kind as the canonical CSV."""
+
+    file: tyro.conf.Positional[Path]
+    """The log: file or folder."""
+    out: Path
+    """The CSV to write; .csv.gz, .npz and .parquet too, by the name."""
+    read: _Read = dataclasses.field(default_factory=Reading)
+    convention: _Convention = PLAIN
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import pipeline
+
+        return pipeline.convert_file(self.file, self.out, self.read, self.convention)
+
+
+_COMMANDS = (Demo, Inspect, Identify, Retrieve, Export, Validate, Diagnose, Predict, Payload, Convert)
 
 
 def _parse(arguments: list[str]) -> Any:
@@ -324,8 +373,10 @@ def _sentence(arguments: list[str], panel: str) -> str:
         known = [*commands, "--help", "--version"]
         what = f"no command {name!r}{_meant(name, known)}" if name else "no command given"
         return f"{what}; there are {', '.join(commands)}: see jaxpanda --help"
-    fields = {"--" + field.name.rstrip("_").replace("_", "-"): field for field in _fields(commands[name])}
+    fields = dict(_spelled(commands[name]))
     given = _options(arguments)
+    if arguments[1:] and not arguments[1].startswith("-"):  # what stands first without an option
+        given += [field for field in fields if field.isupper()]
     words = " ".join(line.strip("╭╮╰╯│─+|- ") for line in panel.splitlines())  # a frame, of lines or of ASCII
     text = " ".join(re.sub(r"[-─]{3,}", " ", words).split())
     unknown = [option for option in given if option not in fields]
@@ -352,11 +403,16 @@ def _sentence(arguments: list[str], panel: str) -> str:
     return f"{what}; see jaxpanda {name} --help"
 
 
-def _fields(command: Any) -> Iterator[dataclasses.Field[Any]]:
-    """The options of a command, those that it shares with others included."""
+def _spelled(command: Any) -> Iterator[tuple[str, dataclasses.Field[Any]]]:
+    """Every field of a command as it is written, those of options that it shares with others included."""
     for field in dataclasses.fields(command):
-        shared = dataclasses.is_dataclass(field.default)
-        yield from _fields(field.default) if shared else [field]
+        kind, *marks = typing.get_args(field.type) or (field.type,)
+        if dataclasses.is_dataclass(kind):
+            yield from _spelled(kind)
+        elif tyro.conf.Positional in marks:
+            yield field.name.upper(), field
+        else:
+            yield "--" + field.name.rstrip("_").replace("_", "-"), field
 
 
 def _options(arguments: list[str]) -> list[str]:

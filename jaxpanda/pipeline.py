@@ -20,7 +20,8 @@ from .identification import Identification, identify, identify_mass_gravity
 from .inspection import Inspection, inspect
 from .lint import lint
 from .mjcf import from_document, from_mjcf
-from .recordings import Recording, distinct, load_many
+from .reading import Reading
+from .recordings import Recording, distinct, load, load_many, save
 from .retrieval import CHECKPOINT_FILE, Retrieval, retrieve
 from .session import progress, telling
 from .urdf import left_out, to_urdf
@@ -38,13 +39,15 @@ def arm_of(model: Path | None, gravity: Sequence[float] | None = None) -> Arm:
 def recordings_of(
     paths: Sequence[Path],
     arm: Arm | None = None,
+    *,
     model: Path | None = None,
+    reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> list[Recording]:
     """Read recordings by the convention of their columns, and make sure that they are of this arm."""
     if not paths:
         raise InputError("--recording: none given; name at least one file or folder")
-    recordings = distinct(convention.applied(load_many(paths), model))
+    recordings = distinct(convention.applied(load_many(paths, reading), model))
     for recording in recordings:
         if arm is not None:
             recording.require_dof(arm.dof)
@@ -61,13 +64,52 @@ class Inspections:
         return {"schema": "jaxpanda.inspections/1", "recordings": [one.to_json() for one in self.recordings]}
 
 
-def inspect_files(paths: Sequence[Path], model: Path | None, convention: Convention = PLAIN) -> Inspections:
+def inspect_files(
+    paths: Sequence[Path],
+    model: Path | None,
+    reading: Reading | None = None,
+    convention: Convention = PLAIN,
+) -> Inspections:
     """`jaxpanda inspect`."""
-    recordings = recordings_of(paths, None, model, convention)
+    recordings = recordings_of(paths, model=model, reading=reading, convention=convention)
     if model is None and any(recording.dof != Arm.panda().dof for recording in recordings):
         return Inspections(tuple(inspect(recording) for recording in recordings))
     arm = arm_of(model, convention.mounting)
     return Inspections(tuple(inspect(recording, arm) for recording in recordings))
+
+
+@dataclasses.dataclass(frozen=True)
+class Conversion:
+    """What was read of a log and written."""
+
+    recording: Recording
+    path: Path
+
+    def to_json(self) -> dict[str, Any]:
+        origin = self.recording.origin
+        return {
+            "schema": "jaxpanda.conversion/1",
+            "path": str(self.path),
+            "samples": self.recording.samples,
+            "joints": self.recording.dof,
+            "origin": None if origin is None else origin.to_json(),
+            "repairs": dict(self.recording.repairs),
+            "notes": list(self.recording.notes),
+        }
+
+
+def convert_file(file: Path, out: Path, reading: Reading, convention: Convention = PLAIN) -> Conversion:
+    """`jaxpanda convert`: the recording of a log, as a file that reads back to the same numbers."""
+    log, end = file.resolve(), out.resolve()
+    if end == log or log in end.parents or (out.exists() and file.exists() and out.samefile(file)):
+        raise InputError(f"--out {out}: is the log itself or lies in it; choose another place")
+    if convention.gravity:
+        raise InputError(
+            "--gravity: is a matter of the model; give it to the command that reads what convert writes"
+        )
+    (recording,) = convention.applied([load(file, reading=reading)])
+    save(recording, out)
+    return Conversion(recording, out)
 
 
 def identify_files(
@@ -81,6 +123,7 @@ def identify_files(
     weighting: str,
     cutoff: float,
     folds: int,
+    reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> Identification:
     """`jaxpanda identify`."""
@@ -93,7 +136,7 @@ def identify_files(
         else:
             with progress("identifying") as tick:
                 found = identify(
-                    recordings_of(recordings, arm, model, convention),
+                    recordings_of(recordings, arm, model=model, reading=reading, convention=convention),
                     arm,
                     method=method,
                     friction=friction,
@@ -225,6 +268,7 @@ def validate_files(
     *,
     cutoff: float,
     in_mjx: bool = True,
+    reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> Validation:
     """`jaxpanda validate`: with the offset in an exported file's sidecar, and what the lint has to say."""
@@ -232,9 +276,9 @@ def validate_files(
     with output_folder(out) as folder, telling("validating") as say:
         say(f"comparing inverse dynamics, torque and a roll-out in {engines}")
         friction, beside = beyond_mjcf(model)
-        read = recordings_of(recordings, None, model, convention)
+        logs = recordings_of(recordings, model=model, reading=reading, convention=convention)
         checked = validate(
-            model, read, cutoff=cutoff, in_mjx=in_mjx, friction=friction, gravity=convention.mounting
+            model, logs, cutoff=cutoff, in_mjx=in_mjx, friction=friction, gravity=convention.mounting
         )
         slips = tuple(f"{slip.severity}: {slip.where}: {slip.message}" for slip in lint(model))
         checked = dataclasses.replace(checked, notes=(*checked.notes, *beside, *slips))

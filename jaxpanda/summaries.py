@@ -28,6 +28,15 @@ def inspection(one: Any) -> Section:
     return Section(f"Recording {one.name}", one.lines(), [Table(columns, quantities)])
 
 
+def conversion(made: Any) -> Sequence[Section]:
+    """What was read of a log, and where it was written."""
+    log = made.recording
+    lines = [f"{log.samples} samples of {log.dof} joints, written to {made.path}"]
+    lines += log.origin.lines() if log.origin else []
+    lines += [f"{what}: {count}" for what, count in log.repairs.items()]
+    return [Section(f"Recording {log.name}", [*lines, *log.notes])]
+
+
 def identification(found: Any) -> Sequence[Section]:
     """Coefficients with their deviations, friction, and what is left unexplained."""
     names = found.joint_names or [f"joint {i + 1}" for i in range(found.dof)]
@@ -377,5 +386,6 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Misread": diagnosis,
     "Prediction": prediction,
     "PayloadEstimate": payload,
+    "Conversion": conversion,
     "Demonstration": lambda result: result.sections,
 }

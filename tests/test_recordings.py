@@ -75,7 +75,7 @@ def test_saving_twice_writes_the_same_bytes(tmp_path):
 def test_saving_replaces_whole_or_not_at_all(tmp_path):
     with pytest.raises(InputError, match=r"no such|does not exist"):
         save(recording(), tmp_path / "nowhere" / "rec.csv")
-    with pytest.raises(InputError, match="unknown kind"):
+    with pytest.raises(InputError, match="are written as"):
         save(recording(), tmp_path / "rec.mat")
     assert not list(tmp_path.iterdir())
 
@@ -249,7 +249,7 @@ def test_line_numbers_count_blank_lines(tmp_path):
         ("bytes.parquet", bytes(range(256)) * 20, "no Parquet file"),
         ("empty.npz", b"", "no NumPy archive"),
         ("empty.parquet", b"", "no Parquet file"),
-        ("log.mat", b"MATLAB", "unknown kind of recording"),
+        ("log.xlsx", b"PK", "unknown kind of recording"),
     ],
 )
 def test_garbage_is_refused_whatever_it_calls_itself(tmp_path, name, content, message):
@@ -265,8 +265,8 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
     for format in ("csv", "npz", "parquet", "raw_logs"):
         with pytest.raises(InputError, match="no such"):
             load(tmp_path / "nowhere", format=format)
-    with pytest.raises(InputError, match="unknown format 'bag'"):
-        load(tmp_path / "nowhere", format="bag")
+    with pytest.raises(InputError, match="unknown format 'ods'"):
+        load(tmp_path / "nowhere", format="ods")
 
 
 def _npz(tmp_path, **arrays):

@@ -16,6 +16,7 @@ from ..corrected import XML, read
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_folder, write_text
+from ..reading import Reading
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
 from ..session import telling
@@ -60,6 +61,8 @@ def diagnose_files(
     recordings: Sequence[Path],
     reference: Sequence[Path],
     knowledge: Knowledge,
+    *,
+    reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> Diagnosis | resting.AtRest | meaning.Misread:
     """`jaxpanda diagnose`."""
@@ -68,7 +71,9 @@ def diagnose_files(
     with output_folder(out) as folder, telling("diagnosing") as say:
         count = len(recordings) + len(reference)
         say(f"reading {count} recording{'s' * (count != 1)}")
-        suspect, healthy = (convention.applied(load_many(ps), model) for ps in (recordings, reference))
+        suspect, healthy = (
+            convention.applied(load_many(paths, reading), model) for paths in (recordings, reference)
+        )
         every = distinct([*suspect, *healthy])
         suspect, healthy = every[: len(suspect)], every[len(suspect) :]
         found = diagnose(
@@ -145,9 +150,17 @@ def _source(role: str, path: Path, names: Mapping[Path | None, str]) -> dict[str
     return {"role": role, "name": name, "sha256": digest.hexdigest()}
 
 
-def predict_files(diagnosis: Path, recording: Path, out: Path) -> Prediction:
+def predict_files(
+    diagnosis: Path,
+    recording: Path,
+    out: Path,
+    reading: Reading | None = None,
+    convention: Convention = PLAIN,
+) -> Prediction:
     """`jaxpanda predict`: torque, and where the motion has torque recorded, how far it is off."""
-    motion = load(recording)
+    if convention.mounting is not None:
+        raise InputError(f"--gravity: {XML} has its gravity already; give it to the command diagnose")
+    (motion,) = convention.applied([load(recording, reading=reading)], diagnosis / XML)
     arm = read(diagnosis)[0].arm
     tau = predict(diagnosis, motion)
     head = ",".join(["time", *(f"tau_{j + 1}" for j in range(tau.shape[1]))])

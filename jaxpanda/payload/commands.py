@@ -8,6 +8,7 @@ from ..convention import PLAIN, Convention
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_folder
+from ..reading import Reading
 from ..recordings import load_many
 from .estimate import estimate_payload
 from .result import MODEL_XML, PayloadEstimate
@@ -21,6 +22,7 @@ def payload_files(
     *,
     frame: str,
     torque_scale_std: float,
+    reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> PayloadEstimate:
     """`jaxpanda payload`."""
@@ -30,8 +32,8 @@ def payload_files(
     with output_folder(out):
         found = estimate_payload(
             model,
-            convention.applied(load_many(without), model),
-            convention.applied(load_many(loaded), model),
+            convention.applied(load_many(without, reading), model),
+            convention.applied(load_many(loaded, reading), model),
             frame=frame,
             torque_scale_std=torque_scale_std,
             gravity=convention.mounting,

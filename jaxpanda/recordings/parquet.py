@@ -1,51 +1,148 @@
-"""Parquet with the canonical columns as scalar float64 columns; needs the extra [io]."""
+"""Parquet: the canonical columns as scalar float64 columns, or those of a data set; needs the extra [io].
 
-from collections.abc import Mapping
+A column of lists is `name[0]`, `name[1]`, …; a file of several episodes has a column that numbers them.
+"""
+
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
 from ..errors import InputError, MissingExtraError
-from .checks import checked
-from .csv import canonical_names, find_channels, from_table
+from ..reading import Reading
 from .recording import Recording
+from .table import Source, Table, canonical_names, chosen, recording_of, refuse
+from .voraus import VORAUS
+
+EPISODES = ("episode_index",)
+"""Columns that number the episodes of a file whose source does not say which does."""
 
 
-def read_parquet(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
-    """A recording from Parquet.
-
-    Args:
-        path: the file.
-        columns: {canonical name: name in the file} where the two differ.
+def read_parquet(path: Path, reading: Reading) -> list[Recording]:
+    """The recording in a Parquet file, or those of its episodes that are asked for.
 
     Raises:
         MissingExtraError: pyarrow is not installed.
         InputError: naming file and column, and what would work.
     """
-    arrow, parquet = _pyarrow()
+    refuse(path.name, reading, "topic")
+    return read_episodes([path], path, path.name, (VORAUS,), reading)
+
+
+def read_episodes(
+    files: Sequence[Path], path: Path, name: str, sources: Sequence[Source], reading: Reading
+) -> list[Recording]:
+    """The episodes asked for of a data set that lies in several files of one form.
+
+    Args:
+        files: in the order of their rows.
+        path: file or folder that the recordings come from.
+        name: as messages call it.
+        sources: who writes such data sets.
+        reading: what is meant.
+    """
+    arrow, parquet = pyarrow()
     try:
-        content = parquet.read_table(path)
+        schemas = [parquet.read_schema(file) for file in files]
+        names, kept, widths = _columns(arrow, schemas[0], parquet, files[0])
+        marks = [s.episode for s in sources if s.episode and set(s.marks) <= set(names)] or list(EPISODES)
+        episode = next((mark for mark in marks if mark in names), "")
+        numbers = [_numbers(parquet, file, episode) for file in files] if episode else []
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (OSError, arrow.ArrowInvalid) as error:
+    except (OSError, arrow.ArrowException) as error:
+        raise InputError(f"{name}: no Parquet file, or a broken one ({str(error).splitlines()[0]})") from None
+    if not episode:
+        refuse(name, reading, "episode")
+        return [recording_of(_table(files, None, path, name, names, kept, widths), sources, reading)]
+    every = sorted({int(k) for each in numbers for k in np.unique(each)})
+    wanted = chosen(name, [str(k) for k in every], reading)
+    out = []
+    for number in map(int, wanted):
+        rows = [np.flatnonzero(each == number) for each in numbers]
+        called = name if len(every) == 1 else f"{name} (episode {number})"
+        out.append(recording_of(_table(files, rows, path, called, names, kept, widths), sources, reading))
+    return out
+
+
+def _columns(arrow: ModuleType, schema, parquet: ModuleType, file: Path):
+    """Names of all columns, lists taken apart; of each, the column it is in; of each list, its width."""
+    first = None
+    names: list[str] = []
+    kept: list[tuple[str, int | None]] = []
+    widths: dict[str, int] = {}
+    for field in schema:
+        kind = field.type
+        if (
+            arrow.types.is_list(kind)
+            or arrow.types.is_large_list(kind)
+            or arrow.types.is_fixed_size_list(kind)
+        ):
+            if not arrow.types.is_primitive(kind.value_type):
+                continue
+            if arrow.types.is_fixed_size_list(kind):
+                width = kind.list_size
+            else:
+                if first is None:
+                    first = next(parquet.ParquetFile(file).iter_batches(1), None)
+                width = len(first.column(field.name)[0].as_py() or ()) if first is not None else 0
+            widths[field.name] = width
+            names += [f"{field.name}[{k}]" for k in range(width)]
+            kept += [(field.name, k) for k in range(width)]
+        else:
+            names.append(field.name)
+            kept.append((field.name, None))
+    return names, kept, widths
+
+
+def _numbers(parquet: ModuleType, file: Path, episode: str) -> np.ndarray:
+    return parquet.read_table(file, columns=[episode]).column(episode).to_numpy()
+
+
+def _table(files, rows, path, name, names, kept, widths) -> Table:
+    """Columns of some rows of every file; None for all rows."""
+
+    def take(places: Sequence[int]) -> np.ndarray:
+        arrow, parquet = pyarrow()
+        wanted = list(dict.fromkeys(kept[i][0] for i in places))
+        parts = []
+        for k, file in enumerate(files):
+            if rows is not None and not len(rows[k]):
+                continue
+            content = parquet.read_table(file, columns=wanted)
+            if rows is not None:
+                content = content.take(arrow.array(rows[k]))
+            arrays = {column: _array(arrow, content, column, widths.get(column), name) for column in wanted}
+            parts.append(
+                np.column_stack(
+                    [arrays[c] if j is None else arrays[c][:, j] for c, j in (kept[i] for i in places)]
+                )
+            )
+        return np.concatenate(parts) if parts else np.zeros((0, len(places)))
+
+    return Table(path, name, names, take)
+
+
+def _array(arrow: ModuleType, content, column: str, width: int | None, name: str) -> np.ndarray:
+    """One column as float64; a list is a row of a matrix."""
+    values = content.column(column).combine_chunks()
+    kind = values.type if width is None else values.type.value_type
+    if not (arrow.types.is_floating(kind) or arrow.types.is_integer(kind)):
+        raise InputError(f"{name}: column {column} holds {kind}, where numbers are needed")
+    if width is None:
+        return values.to_numpy(zero_copy_only=False).astype(float)
+    flat = values.flatten().to_numpy(zero_copy_only=False).astype(float)
+    if len(flat) != width * len(values):
         raise InputError(
-            f"{path.name}: no Parquet file, or a broken one ({str(error).splitlines()[0]})"
-        ) from None
-    names = content.column_names
-    channels = find_channels(names, path.name, columns)
-    table = np.full((content.num_rows, len(names)), np.nan)
-    for i in [place for places in channels.values() for place in places]:
-        kind = content.schema.field(i).type
-        if not (arrow.types.is_floating(kind) or arrow.types.is_integer(kind)):
-            raise InputError(f"{path.name}: column {names[i]} holds {kind}, where numbers are needed")
-        table[:, i] = content.column(i).to_numpy().astype(float)
-    return checked(from_table(path, names, table, channels))
+            f"{name}: column {column} holds lists of several lengths, where all must have {width} numbers"
+        )
+    return flat.reshape(-1, width)
 
 
 def write_parquet(recording: Recording, path: Path) -> None:
     """The canonical columns, losslessly compressed."""
-    arrow, parquet = _pyarrow()
+    arrow, parquet = pyarrow()
     names = canonical_names(recording.dof, recording.qd is not None, recording.tau is not None)
     table = np.column_stack([recording.time, *recording.channels()])
     parquet.write_table(
@@ -53,7 +150,8 @@ def write_parquet(recording: Recording, path: Path) -> None:
     )
 
 
-def _pyarrow() -> tuple[ModuleType, ModuleType]:
+def pyarrow() -> tuple[ModuleType, ModuleType]:
+    """pyarrow and its Parquet module."""
     try:
         import pyarrow
         import pyarrow.parquet

@@ -4,6 +4,7 @@ A file holds one number a line (`dof` consecutive numbers are a sample) or one s
 host stamped: true ticks are reconstructed where they can be and are better (`ticks`).
 """
 
+import dataclasses
 import itertools
 import re
 from collections.abc import Mapping
@@ -13,8 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
+from ..reading import Reading
 from .checks import checked
-from .recording import Recording
+from .recording import Origin, Recording
+from .table import chosen, refuse, within
 from .text import numbers, read_text
 from .ticks import Ticks, consistent, reconstruct
 
@@ -41,17 +44,18 @@ _SUFFIX = re.compile(r"\.(txt|dat|log)(\.gz)?$", re.IGNORECASE)
 _SLACK = 5  # rows by which the files of one log may differ in length
 
 
-def read_raw_logs(path: Path, columns: Mapping[str, str] | None = None) -> list[Recording]:
-    """The runs logged in a folder; a new run begins where time goes back.
+def read_raw_logs(path: Path, reading: Reading) -> list[Recording]:
+    """The runs logged in a folder; a new run begins where time goes back, and is an episode from 1 on.
 
     Args:
         path: the folder.
-        columns: {time, q, dq or tau: file name} where the names do not say it.
+        reading: `columns` names the file of a channel where the names do not say it.
 
     Raises:
         InputError: naming the folder or file and the row, and what would work.
     """
-    files = find_logs(path, columns)
+    refuse(path.name, reading, "topic")
+    files = find_logs(path, reading.channels())
     time = _numbers(files["time"], "time")
     if time.shape[1] != 1:
         raise InputError(f"{files['time'].name}: {time.shape[1]} numbers a line, where time has one")
@@ -66,11 +70,22 @@ def read_raw_logs(path: Path, columns: Mapping[str, str] | None = None) -> list[
     stamps = logs["time"][:, 0]
     breaks = [0, *(np.flatnonzero(np.diff(stamps) < 0) + 1).tolist(), rows]
     runs = []
+    wanted = (
+        chosen(path.name, [str(k) for k in range(1, len(breaks))], reading, "runs")
+        if reading.episode
+        else None
+    )
+    origin = Origin("a folder of logs", {channel: file.name for channel, file in files.items()})
     for number, (start, stop) in enumerate(itertools.pairwise(breaks), 1):
+        if wanted is not None and str(number) not in wanted:
+            continue
         name = path.name if len(breaks) == 2 else f"{path.name} (run {number})"
         run = {channel: log[start:stop] for channel, log in logs.items()}
-        recording = Recording(name, stamps[start:stop], run["q"], run.get("dq"), run.get("tau"), path)
-        runs.append(_on_ticks(recording, start, {"rows cut to the shortest file": cut} if cut else {}))
+        recording = Recording(
+            name, stamps[start:stop], run["q"], run.get("dq"), run.get("tau"), path, origin=origin
+        )
+        repairs = {"rows cut to the shortest file": cut} if cut else {}
+        runs.append(within(_on_ticks(recording, start, repairs), reading)[0])
     return runs
 
 
@@ -88,6 +103,9 @@ def find_logs(path: Path, columns: Mapping[str, str] | None = None) -> dict[str,
     files = sorted(file for file in path.iterdir() if _SUFFIX.search(file.name) and file.is_file())
     found = {channel: _unzipped_first([file for file in files if _is(file, channel)]) for channel in _WORDS}
     for channel, name in (columns or {}).items():
+        if not name:
+            found[channel] = []
+            continue
         if not (path / name).is_file():
             raise InputError(f"{path}: no file {name!r} (asked for as {channel}) in this folder")
         found[channel] = [path / name]
@@ -107,8 +125,8 @@ def find_logs(path: Path, columns: Mapping[str, str] | None = None) -> dict[str,
         if len(likely) > 1:
             names = ", ".join(file.name for file in likely)
             raise InputError(
-                f"{path}: {names} could each be {channel}: move the others away, or say which from Python: "
-                f"load(path, columns={{'{channel}': 'the file meant'}})"
+                f"{path}: {names} could each be {channel}: move the others away, or say which by"
+                f" --columns {channel}=FILE"
             )
         if likely:
             chosen[channel] = likely[0]
@@ -185,13 +203,15 @@ def _on_ticks(recording: Recording, start: int, repairs: dict[str, int]) -> Reco
     """The recording with its rows on true ticks if that is better than the stamps, checked either way."""
     row = lambda i: f"row {start + i + 1}"
     if recording.qd is None or recording.samples < 40 or consistent(recording.time):
-        return checked(_replace(recording, repairs), row)
+        return checked(dataclasses.replace(recording, repairs=repairs), row)
     ticks = reconstruct(recording.time, recording.q, recording.qd, recording.tau)
     if ticks is None:
-        return checked(_replace(recording, repairs), row)
+        return checked(dataclasses.replace(recording, repairs=repairs), row)
     evidence = _evidence(ticks)
     if not ticks.better:
-        return checked(_replace(recording, repairs, (f"the stamps are kept: {evidence}",)), row)
+        return checked(
+            dataclasses.replace(recording, repairs=repairs, notes=(f"the stamps are kept: {evidence}",)), row
+        )
     new = np.concatenate([[True], np.diff(ticks.tick) > 0])
     repairs |= {
         "repeated rows dropped": int(np.sum(~new)),
@@ -199,30 +219,16 @@ def _on_ticks(recording: Recording, start: int, repairs: dict[str, int]) -> Reco
         "rows at rest put on a tick by their stamp": ticks.stamped,
         "ticks missing between rows": int(ticks.tick[-1] + 1 - np.sum(new)),
     }
-    moved = Recording(
-        recording.name,
-        ticks.tick[new] * ticks.period,
-        recording.q[new],
-        recording.qd[new],
-        None if recording.tau is None else recording.tau[new],
-        recording.path,
-        repairs,
-        (f"rows are on reconstructed ticks: {evidence}",),
+    moved = dataclasses.replace(
+        recording,
+        time=ticks.tick[new] * ticks.period,
+        q=recording.q[new],
+        qd=recording.qd[new],
+        tau=None if recording.tau is None else recording.tau[new],
+        repairs=repairs,
+        notes=(f"rows are on reconstructed ticks: {evidence}",),
     )
     return checked(moved)
-
-
-def _replace(recording: Recording, repairs: dict[str, int], notes: tuple[str, ...] = ()) -> Recording:
-    return Recording(
-        recording.name,
-        recording.time,
-        recording.q,
-        recording.qd,
-        recording.tau,
-        recording.path,
-        repairs,
-        notes,
-    )
 
 
 def _evidence(ticks: Ticks) -> str:

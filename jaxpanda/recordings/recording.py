@@ -3,11 +3,36 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
+
+Torque = Literal["measured", "gravity_removed", "current", "commanded", "motor_side", "unstated"]
+"""What a source says its torque is; `measured` is what a recording's must be."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Which of a log's columns a recording was made of, and what the log's source says they are."""
+
+    source: str
+    """Who writes such logs, or who says what the columns are."""
+    channels: Mapping[str, str]
+    """Of time, q, dq and tau, the columns they were taken from."""
+    torque: Torque = "unstated"
+    says: str = ""
+    """Of torque, in words."""
+
+    def lines(self) -> list[str]:
+        """For who looks at a recording."""
+        took = "; ".join(f"{channel} from {columns}" for channel, columns in self.channels.items())
+        return [f"taken for {self.source}: {took}", *([f"its source says: {self.says}"] if self.says else [])]
+
+    def to_json(self) -> dict[str, Any]:
+        return {**dataclasses.asdict(self), "channels": dict(self.channels)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +59,8 @@ class Recording:
     """What else reading found out, and the evidence for the repairs, in plain words."""
     stamps: Float[np.ndarray, " time"] | None = None
     """Time as it was written [s], where rows were moved to ticks; else None."""
+    origin: Origin | None = None
+    """What a file called the channels; None where the recording comes from no file."""
 
     @property
     def dof(self) -> int:
@@ -63,8 +90,9 @@ class Recording:
     def require_tau(self) -> Float[np.ndarray, "time dof"]:
         """The measured torque; refuse a motion."""
         if self.tau is None:
+            said = f" ({self.origin.says})" if self.origin and self.origin.says else ""
             raise InputError(
                 f"{self.name}: no columns tau_1 ... tau_{self.dof}: this needs measured joint torques, not a "
-                "motion"
+                f"motion{said}"
             )
         return self.tau
