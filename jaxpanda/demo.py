@@ -15,7 +15,7 @@ from jaxtyping import Float
 from . import report, summaries
 from .errors import require_x64
 from .export import panda_mjcf
-from .files import output_folder
+from .files import Kind, output_folder
 from .identification import Identification, identify
 from .inspection import inspect
 from .mjcf import from_mjcf, standard_from_com
@@ -39,6 +39,7 @@ from .validation import Validation, arm_model, validate
 
 MODEL = "panda.xml"
 REPORT = "report.html"
+_LEAVES = ("validation.json", "identification.json", "retrieval.json", MODEL, REPORT)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +103,8 @@ def demonstrate(
     require_x64("demonstrate")
     began = time.perf_counter()
     arm = arm_of(model)
-    with output_folder(out) as folder:
+    made = () if recordings else ("recording.csv", "held_out.csv")
+    with output_folder(out, Kind("demo", (*_LEAVES, *made))) as folder:
         if recordings:
             virtual = None
             training = recordings_of(recordings, arm)

@@ -5,6 +5,7 @@ elements know the bytes of their start tag, and an edit replaces some of them.
 """
 
 import dataclasses
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -14,7 +15,11 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
+from . import inputs
 from .errors import InputError
+
+BYTES = 1 << 26
+"""Most that a file of a model may have."""
 
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
 _TAG = re.compile(rb"""<[^\s/>]+(?:"[^"]*"|'[^']*'|[^"'>])*>""")
@@ -65,6 +70,8 @@ class Document:
     texts: Mapping[str, str]
     """Text by the name the file is included by; the main file under ''."""
     root: Element
+    inclusions: Mapping[str, Element] = dataclasses.field(default_factory=dict)
+    """The `include` element of each of the other texts."""
 
     @property
     def text(self) -> str:
@@ -82,11 +89,7 @@ def read(path: str | Path, root: str) -> Document:
         InputError: a file cannot be read, is no well-formed XML, or the first element is no `root`.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    return parse(_decode(data, path), root, path)
+    return parse(_decode(inputs.read_bytes(path, BYTES), path), root, path)
 
 
 def parse(text: str, root: str, path: Path, known: Mapping[str, str] | None = None) -> Document:
@@ -94,13 +97,13 @@ def parse(text: str, root: str, path: Path, known: Mapping[str, str] | None = No
     tree = _tree(text, path)
     if tree.tag != root:
         raise InputError(f"{path}: line {tree.line}: starts with <{tree.tag}>, where <{root}> is expected")
-    texts = {"": text}
-    _include(tree, path, known or {}, texts)
-    return Document(path, texts, tree)
+    texts, inclusions = {"": text}, {}
+    _include(tree, path, known or {}, texts, inclusions)
+    return Document(path, texts, tree, inclusions)
 
 
-def edit(document: Document, edits: Iterable[Edit]) -> Document:
-    """The document with these edits, every other byte as it was."""
+def edit(document: Document, edits: Iterable[Edit], names: Mapping[str, str] | None = None) -> Document:
+    """The document with these edits, every other byte as it was; `names` gives included texts others."""
     texts = dict(document.texts)
     data = {name: text.encode() for name, text in texts.items()}
     replacements: dict[str, list[tuple[int, int, bytes]]] = {}
@@ -111,7 +114,21 @@ def edit(document: Document, edits: Iterable[Edit]) -> Document:
         for start, stop, new in sorted(parts, reverse=True):
             data[name] = data[name][:start] + new + data[name][stop:]
         texts[name] = data[name].decode()
-    return parse(texts[""], document.root.tag, document.path, {k: v for k, v in texts.items() if k})
+    known = {(names or {}).get(name, name): text for name, text in texts.items() if name}
+    return parse(texts[""], document.root.tag, document.path, known)
+
+
+def gathered(document: Document) -> Document:
+    """The document with what it includes from outside of its folder called by a name inside of it."""
+    names: dict[str, str] = {}
+    for name in document.inclusions:
+        if (inside := os.path.normpath(name)).startswith("..") or os.path.isabs(inside):
+            inside = Path(name).name
+            while inside in {*document.texts, *names.values(), document.path.name}:
+                inside = f"included_{inside}"
+            names[name] = inside
+    edits = [Edit(document.inclusions[old], {"file": new}) for old, new in names.items()]
+    return edit(document, edits, names) if names else document
 
 
 def quote(value: str) -> str:
@@ -175,12 +192,18 @@ def _resolve(path: Path, name: str, includer: Path) -> Path:
     return beside if beside.exists() else includer.parent / name
 
 
-def _include(tree: Element, path: Path, known: Mapping[str, str], texts: dict[str, str]) -> None:
+def _include(
+    tree: Element,
+    path: Path,
+    known: Mapping[str, str],
+    texts: dict[str, str],
+    inclusions: dict[str, Element],
+) -> None:
     """Put the children of every included file where its `include` stands."""
     children = []
     for child in tree.children:
         if child.tag != "include":
-            _include(child, path, known, texts)
+            _include(child, path, known, texts, inclusions)
             children.append(child)
             continue
         name = child.attributes.get("file", "")
@@ -191,14 +214,10 @@ def _include(tree: Element, path: Path, known: Mapping[str, str], texts: dict[st
         if name in known:
             texts[name] = known[name]
         else:
-            try:
-                texts[name] = _decode(file.read_bytes(), file)
-            except OSError as error:
-                raise InputError(
-                    f"{where}: includes {name!r}, which cannot be read ({error.strerror})"
-                ) from None
+            texts[name] = _decode(inputs.read_bytes(file, BYTES, f"{where}: includes {name!r}, which"), file)
         included = _tree(texts[name], file, name)
-        _include(included, path, known, texts)
+        inclusions[name] = child
+        _include(included, path, known, texts, inclusions)
         for element in included.children:
             element.parent = tree
             children.append(element)

@@ -23,7 +23,7 @@ import numpy as np
 from jaxpanda_kernels import Chain
 from jaxtyping import Float
 
-from . import markup
+from . import inputs, markup
 from .arm import KNOWN, Arm
 from .errors import InputError
 
@@ -187,7 +187,11 @@ def _attached(document: markup.Document) -> dict[str, bytes]:
     """Other models that the file attaches parts of."""
     names = [e.attributes.get("file", "") for e in document.root.walk() if e.tag == "model"]
     files = {name: document.path.parent / name for name in names if name}
-    return {name: file.read_bytes() for name, file in files.items() if file.is_file()}
+    return {
+        name: inputs.read_bytes(file, markup.BYTES, f"{document.path}: attaches {name!r}, which")
+        for name, file in files.items()
+        if file.exists()
+    }
 
 
 def _compile(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:

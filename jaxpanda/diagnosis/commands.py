@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .. import report
-from ..corrected import XML, read
+from .. import inputs, report
+from ..corrected import KIND, XML, read
 from ..errors import InputError
 from ..export import missing_assets
-from ..files import output_folder, write_text
+from ..files import output_file, output_folder, write_text
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
 from ..session import telling
@@ -63,7 +63,7 @@ def diagnose_files(
     """`jaxpanda diagnose`."""
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
-    with output_folder(out) as folder, telling("diagnosing") as say:
+    with output_folder(out, KIND) as folder, telling("diagnosing") as say:
         count = len(recordings) + len(reference)
         say(f"reading {count} recording{'s' * (count != 1)}")
         suspect, healthy = load_many(recordings), load_many(reference)
@@ -87,7 +87,7 @@ def diagnose_files(
             say("writing the report")
             sections = page.sections(found)
         report.to_html("jaxpanda: diagnosis", sections, folder / "report.html")
-        found.save(out)  # not by way of the other folder: what is included may belong outside of `out`
+        found.save(folder)
     return found
 
 
@@ -131,19 +131,25 @@ def _source(role: str, path: Path, names: Mapping[Path | None, str]) -> dict[str
     parts = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     digest = hashlib.sha256()
     for part in parts:
-        digest.update(part.read_bytes())
+        digest.update(inputs.read_bytes(part))
     name = path.name if path.is_dir() else names.get(path, path.name)
     return {"role": role, "name": name, "sha256": digest.hexdigest()}
 
 
+_OWN = re.compile(rb"time(,tau_\d+)+\n")  # no recording has torque and no position
+
+
 def predict_files(diagnosis: Path, recording: Path, out: Path) -> Prediction:
     """`jaxpanda predict`: torque, and where the motion has torque recorded, how far it is off."""
+    if out.suffix.lower() != ".csv":
+        raise InputError(f"{out}: a name ending in .csv is needed")
     motion = load(recording)
     arm = read(diagnosis)[0].arm
     tau = predict(diagnosis, motion)
     head = ",".join(["time", *(f"tau_{j + 1}" for j in range(tau.shape[1]))])
     table = np.column_stack([motion.time if motion.stamps is None else motion.stamps, tau]).tolist()
-    write_text(out, "\n".join([head, *(",".join(map(repr, row)) for row in table)]) + "\n")
+    with output_file(out, lambda content: _OWN.match(content) is not None) as file:
+        write_text(file, "\n".join([head, *(",".join(map(repr, row)) for row in table)]) + "\n")
     made = Prediction(out, len(tau), arm.joint_names, arm.unit("N·m"), _rms(tau))
     if motion.tau is None:
         return made

@@ -1,15 +1,14 @@
 """Recordings from files and folders, and back."""
 
 import dataclasses
-import os
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..errors import InputError
-from .csv import read_csv, write_csv
-from .npz import read_npz, write_npz
-from .parquet import read_parquet, write_parquet
+from ..files import write_bytes
+from .csv import csv_bytes, read_csv
+from .npz import npz_bytes, read_npz
+from .parquet import parquet_bytes, read_parquet
 from .raw_logs import read_raw_logs
 from .recording import Recording
 
@@ -19,10 +18,10 @@ _READERS: Mapping[str, Callable[[Path, Mapping[str, str] | None], Recording]] = 
     "parquet": read_parquet,
     "raw_logs": lambda path, columns: _only(read_raw_logs(path, columns), path),
 }
-_WRITERS: Mapping[str, Callable[[Recording, Path], None]] = {
-    "csv": write_csv,
-    "npz": write_npz,
-    "parquet": write_parquet,
+_WRITERS: Mapping[str, Callable[[Recording, str], bytes]] = {
+    "csv": csv_bytes,
+    "npz": npz_bytes,
+    "parquet": parquet_bytes,
 }
 _SUFFIXES = {".csv": "csv", ".csv.gz": "csv", ".npz": "npz", ".parquet": "parquet"}
 
@@ -84,16 +83,14 @@ def save(recording: Recording, path: str | Path) -> None:
     Every number reads back to the same float64. Repairs and notes are not kept in the file.
 
     Raises:
-        InputError: unknown suffix, or a folder that does not exist.
+        InputError: unknown suffix, a folder that does not exist, or `path` is a link or device.
+        OutputError: the disk is full.
     """
     path = Path(path)
     writer = _WRITERS[_by_suffix(path)]
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist")
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".jaxpanda-") as folder:
-        partial = Path(folder) / path.name
-        writer(recording, partial)
-        os.replace(partial, path)
+    write_bytes(path, writer(recording, path.name))
 
 
 def _format(path: Path, format: str) -> str:

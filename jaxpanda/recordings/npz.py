@@ -1,12 +1,12 @@
 """NumPy archives: arrays `time` (n,), `q`, `dq` or `qd`, `tau` (n, dof)."""
 
-import zipfile
-import zlib
+import io
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from .. import inputs
 from ..errors import InputError
 from .checks import checked
 from .recording import Recording
@@ -46,32 +46,19 @@ def read_npz(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
 
 
 def _arrays(path: Path, columns: Mapping[str, str] | None) -> dict[str, np.ndarray | None]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(
-                    f"{path.name}: a single array, where an archive with time, q, dq, tau is needed"
-                )
-            return {channel: _array(archive, channel, path, columns) for channel in _ALIASES}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path.name}: no NumPy archive, or a broken one ({error})") from None
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(
-            f"{path.name}: holds no plain arrays ({error}): save numbers only, no objects"
-        ) from None
+    archive = inputs.read_npz(path)
+    return {channel: _array(archive, channel, path, columns) for channel in _ALIASES}
 
 
-def _array(archive, channel: str, path: Path, columns: Mapping[str, str] | None) -> np.ndarray | None:
+def _array(
+    archive: Mapping[str, np.ndarray], channel: str, path: Path, columns: Mapping[str, str] | None
+) -> np.ndarray | None:
     asked = (columns or {}).get(channel)
-    if asked is not None and asked not in archive.files:
+    if asked is not None and asked not in archive:
         raise InputError(
-            f"{path.name}: no array {asked!r} (asked for as {channel}); it has {', '.join(archive.files)}"
+            f"{path.name}: no array {asked!r} (asked for as {channel}); it has {', '.join(archive)}"
         )
-    present = [asked] if asked else [name for name in _ALIASES[channel] if name in archive.files]
+    present = [asked] if asked else [name for name in _ALIASES[channel] if name in archive]
     if not present:
         return None
     if len(present) > 1:
@@ -84,8 +71,8 @@ def _array(archive, channel: str, path: Path, columns: Mapping[str, str] | None)
     return np.asarray(array, dtype=float)
 
 
-def write_npz(recording: Recording, path: Path) -> None:
+def npz_bytes(recording: Recording, name: str) -> bytes:
     """The archive that `read_npz` reads."""
     arrays = {"time": recording.time, "q": recording.q, "dq": recording.qd, "tau": recording.tau}
-    with path.open("wb") as file:
-        np.savez_compressed(file, **{name: array for name, array in arrays.items() if array is not None})
+    np.savez_compressed(out := io.BytesIO(), **{name: a for name, a in arrays.items() if a is not None})
+    return out.getvalue()
