@@ -1,5 +1,6 @@
 """What arms' logs say: read, checked, and every repair counted."""
 
+from .checks import plausible as plausible
 from .files import distinct as distinct
 from .files import load as load
 from .files import load_many as load_many

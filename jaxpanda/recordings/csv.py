@@ -2,7 +2,7 @@
 
 import gzip
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +49,7 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
     def row(i: int) -> str:
         return f"row {i + 1} (line {filled[i] if filled else start + 2 + i})"
 
-    return checked(from_table(path, names, table, channels), row)
+    return checked(from_table(path, names, table, channels, row), row)
 
 
 def canonical(dof: int) -> str:
@@ -140,8 +140,14 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def from_table(path: Path, names: list[str], table: np.ndarray, channels: dict[str, list[int]]) -> Recording:
-    """The recording in a table whose columns `find_channels` has found."""
+def from_table(
+    path: Path,
+    names: list[str],
+    table: np.ndarray,
+    channels: dict[str, list[int]],
+    row: Callable[[int], str] | None = None,
+) -> Recording:
+    """The recording in a table whose columns `find_channels` has found; `row` as `Recording` has it."""
     used = {i for places in channels.values() for i in places}
     ignored = [name or "(no name)" for i, name in enumerate(names) if i not in used]
 
@@ -155,6 +161,7 @@ def from_table(path: Path, names: list[str], table: np.ndarray, channels: dict[s
         qd=take("dq"),
         tau=take("tau"),
         path=path,
+        row=row,
         notes=(f"ignores {len(ignored)} other columns: {', '.join(ignored[:8])}",) if ignored else (),
     )
 

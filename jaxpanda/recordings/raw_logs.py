@@ -4,9 +4,10 @@ A file holds one number a line (`dof` consecutive numbers are a sample) or one s
 host stamped: true ticks are reconstructed where they can be and are better (`ticks`).
 """
 
+import dataclasses
 import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -69,8 +70,8 @@ def read_raw_logs(path: Path, columns: Mapping[str, str] | None = None) -> list[
     for number, (start, stop) in enumerate(itertools.pairwise(breaks), 1):
         name = path.name if len(breaks) == 2 else f"{path.name} (run {number})"
         run = {channel: log[start:stop] for channel, log in logs.items()}
-        recording = Recording(name, stamps[start:stop], run["q"], run.get("dq"), run.get("tau"), path)
-        runs.append(_on_ticks(recording, start, {"rows cut to the shortest file": cut} if cut else {}))
+        logged = _Run(name, stamps[start:stop], run["q"], run.get("dq"), run.get("tau"), path)
+        runs.append(_on_ticks(logged, start, {"rows cut to the shortest file": cut} if cut else {}))
     return runs
 
 
@@ -181,17 +182,35 @@ def _same_joints(logs: Mapping[str, np.ndarray], files: Mapping[str, Path]) -> N
             )
 
 
-def _on_ticks(recording: Recording, start: int, repairs: dict[str, int]) -> Recording:
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """Rows as they were logged, whose stamps may repeat."""
+
+    name: str
+    time: Float[np.ndarray, " time"]
+    q: Float[np.ndarray, "time dof"]
+    qd: Float[np.ndarray, "time dof"] | None
+    tau: Float[np.ndarray, "time dof"] | None
+    path: Path
+
+    def recording(
+        self, row: Callable[[int], str], repairs: Mapping[str, int], notes: tuple[str, ...] = ()
+    ) -> Recording:
+        made = Recording(self.name, self.time, self.q, self.qd, self.tau, self.path, repairs, notes, row=row)
+        return checked(made, row)
+
+
+def _on_ticks(run: _Run, start: int, repairs: dict[str, int]) -> Recording:
     """The recording with its rows on true ticks if that is better than the stamps, checked either way."""
     row = lambda i: f"row {start + i + 1}"
-    if recording.qd is None or recording.samples < 40 or consistent(recording.time):
-        return checked(_replace(recording, repairs), row)
-    ticks = reconstruct(recording.time, recording.q, recording.qd, recording.tau)
+    if run.qd is None or len(run.time) < 40 or consistent(run.time):
+        return run.recording(row, repairs)
+    ticks = reconstruct(run.time, run.q, run.qd, run.tau)
     if ticks is None:
-        return checked(_replace(recording, repairs), row)
+        return run.recording(row, repairs)
     evidence = _evidence(ticks)
     if not ticks.better:
-        return checked(_replace(recording, repairs, (f"the stamps are kept: {evidence}",)), row)
+        return run.recording(row, repairs, (f"the stamps are kept: {evidence}",))
     new = np.concatenate([[True], np.diff(ticks.tick) > 0])
     repairs |= {
         "repeated rows dropped": int(np.sum(~new)),
@@ -200,29 +219,16 @@ def _on_ticks(recording: Recording, start: int, repairs: dict[str, int]) -> Reco
         "ticks missing between rows": int(ticks.tick[-1] + 1 - np.sum(new)),
     }
     moved = Recording(
-        recording.name,
+        run.name,
         ticks.tick[new] * ticks.period,
-        recording.q[new],
-        recording.qd[new],
-        None if recording.tau is None else recording.tau[new],
-        recording.path,
+        run.q[new],
+        run.qd[new],
+        None if run.tau is None else run.tau[new],
+        run.path,
         repairs,
         (f"rows are on reconstructed ticks: {evidence}",),
     )
     return checked(moved)
-
-
-def _replace(recording: Recording, repairs: dict[str, int], notes: tuple[str, ...] = ()) -> Recording:
-    return Recording(
-        recording.name,
-        recording.time,
-        recording.q,
-        recording.qd,
-        recording.tau,
-        recording.path,
-        repairs,
-        notes,
-    )
 
 
 def _evidence(ticks: Ticks) -> str:
