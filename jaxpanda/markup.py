@@ -20,6 +20,18 @@ from .errors import InputError
 
 BYTES = 1 << 26
 """Most that a file of a model may have."""
+ELEMENTS, ATTRIBUTES, DEPTH, INCLUDES = 100_000, 500, 200, 50
+"""Most elements of a model (repeated ones each time), attributes of one, levels of elements and of includes."""
+_COUNTS = {
+    "composite": ("count",),
+    "flexcomp": ("count",),
+    "hfield": ("nrow", "ncol"),
+    "texture": ("width", "height"),
+    "user": ("dim",),
+    "size": ("nuserdata", "njmax", "nconmax", "nstack", "nkey"),
+}
+"""Attributes that make MuJoCo allocate their product, by element."""
+_MOST = 1 << 24
 
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
 _TAG = re.compile(rb"""<[^\s/>]+(?:"[^"]*"|'[^']*'|[^"'>])*>""")
@@ -99,7 +111,39 @@ def parse(text: str, root: str, path: Path, known: Mapping[str, str] | None = No
         raise InputError(f"{path}: line {tree.line}: starts with <{tree.tag}>, where <{root}> is expected")
     texts, inclusions = {"": text}, {}
     _include(tree, path, known or {}, texts, inclusions)
+    _require_size(tree)
     return Document(path, texts, tree, inclusions)
+
+
+def _require_size(tree: Element) -> None:
+    """Refuse what would have MuJoCo make millions of parts of a few lines."""
+    total, layer = 0, [(tree, 1.0)]
+    while layer:
+        total += sum(times for _, times in layer)
+        for element, times in layer:
+            numbers = [_whole(element.attributes.get(name, "")) for name in _COUNTS.get(element.tag, ())]
+            if max([times, float(np.prod([max(one, 1) for one in numbers]))]) > _MOST or total > ELEMENTS:
+                raise InputError(
+                    f"{element.file}: line {element.line}: <{element.tag}> makes the model larger than {ELEMENTS}"
+                    f" elements or {_MOST} numbers, which no arm is"
+                )
+        layer = [
+            (
+                child,
+                times
+                * max(1.0, _whole(parent.attributes.get("count", "")) if parent.tag == "replicate" else 1.0),
+            )
+            for parent, times in layer
+            for child in parent.children
+        ]
+
+
+def _whole(words: str) -> float:
+    """The product of the numbers in an attribute; 0 where there are none, which MuJoCo will tell."""
+    try:
+        return float(np.prod([float(word) for word in words.split()])) if words.strip() else 0.0
+    except ValueError:
+        return 0.0
 
 
 def edit(document: Document, edits: Iterable[Edit], names: Mapping[str, str] | None = None) -> Document:
@@ -169,12 +213,23 @@ def _tree(text: str, path: Path, source: str = "") -> Element:
         match = _TAG.match(data, at)
         if match is None:
             raise InputError(f"{path}: line {parser.CurrentLineNumber}: <{tag}> comes from an entity")
+        if len(attributes) > ATTRIBUTES or len(open_elements) >= DEPTH:
+            what = f"{ATTRIBUTES} attributes" if len(attributes) > ATTRIBUTES else f"{DEPTH} levels"
+            raise InputError(
+                f"{path}: line {parser.CurrentLineNumber}: <{tag}> is beyond {what}, which no model needs"
+            )
         parent = open_elements[-1] if open_elements else None
         element = Element(source, path, parser.CurrentLineNumber, tag, attributes, at, match.end(), parent)
         (parent.children if parent else roots).append(element)
         open_elements.append(element)
 
+    def refuse_entity(name: str, *_: Any) -> None:
+        raise InputError(
+            f"{path}: line {parser.CurrentLineNumber}: declares the entity {name!r}, which MJCF has none of"
+        )
+
     parser.StartElementHandler = start
+    parser.EntityDeclHandler = refuse_entity
     parser.EndElementHandler = lambda tag: open_elements.pop()
     try:
         parser.Parse(data, True)
@@ -198,12 +253,13 @@ def _include(
     known: Mapping[str, str],
     texts: dict[str, str],
     inclusions: dict[str, Element],
+    depth: int = 0,
 ) -> None:
     """Put the children of every included file where its `include` stands."""
     children = []
     for child in tree.children:
         if child.tag != "include":
-            _include(child, path, known, texts, inclusions)
+            _include(child, path, known, texts, inclusions, depth)
             children.append(child)
             continue
         name = child.attributes.get("file", "")
@@ -217,7 +273,9 @@ def _include(
             texts[name] = _decode(inputs.read_bytes(file, BYTES, f"{where}: includes {name!r}, which"), file)
         included = _tree(texts[name], file, name)
         inclusions[name] = child
-        _include(included, path, known, texts, inclusions)
+        if depth >= INCLUDES:
+            raise InputError(f"{where}: includes {name!r} at a depth of more than {INCLUDES} files")
+        _include(included, path, known, texts, inclusions, depth + 1)
         for element in included.children:
             element.parent = tree
             children.append(element)

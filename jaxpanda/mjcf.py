@@ -269,6 +269,7 @@ def _check_mesh(spec: mujoco.MjSpec, geom, document: markup.Document) -> None:
             f"{document.path}: body {geom.parent.name!r} takes its inertia from mesh {geom.meshname!r},"
             f" and {file} is missing; put the mesh there or give the body an <inertial>"
         )
+    inputs.require_regular(file)
 
 
 def _serial_joints(model: mujoco.MjModel, path: Path) -> tuple[list[int], list[int]]:

@@ -71,6 +71,10 @@ def find_channels(
     Raises:
         InputError: a column is missing, double, or one joint's column is absent.
     """
+    if len(names) > COLUMNS:
+        raise InputError(
+            f"{file}: {len(names)} columns, where at most {COLUMNS} are read: leave out what is no joint's"
+        )
     seen = [name.lower() for name in names]
     for canonical_name, given in (columns or {}).items():
         if given not in names:
@@ -92,7 +96,9 @@ def find_channels(
     found: dict[str, list[int]] = {"time": [seen.index("time")]}
     for channel in ("q", "dq", "tau"):
         joints = {
-            int(m[1]): i for i, name in enumerate(seen) if (m := re.fullmatch(rf"{channel}_(\d+)", name))
+            int(m[1]): i
+            for i, name in enumerate(seen)
+            if (m := re.fullmatch(rf"{channel}_(\d{{1,9}})", name))
         }
         if joints:
             found[channel] = [joints[j] for j in _complete(sorted(joints), channel, file)]
@@ -108,6 +114,8 @@ def find_channels(
     return found
 
 
+COLUMNS = 5000
+"""Most that a table may have."""
 _MAP = "; rename them, or name them from Python: load(path, columns={'q_1': 'its name in the file', …})"
 
 
@@ -116,9 +124,9 @@ def _known(name: str) -> bool:
 
 
 def _complete(joints: list[int], channel: str, file: str) -> list[int]:
-    missing = sorted(set(range(1, joints[-1] + 1)) - set(joints))
+    missing = next((j for j, there in enumerate([j for j in joints if j], 1) if j != there), None)
     if missing or joints[0] != 1:
-        name = f"{channel}_{missing[0]}" if missing else f"{channel}_{joints[0]}"
+        name = f"{channel}_{missing or joints[0]}"
         raise InputError(
             f"{file}: column {name} is missing, while {channel}_{joints[-1]} is there"
             if missing
