@@ -2,6 +2,7 @@
 
 import dataclasses
 import gzip
+import importlib.util
 import json
 import os
 import shutil
@@ -104,7 +105,7 @@ MODELS_THAT_GROW = {
     "attributes": "<worldbody><body " + " ".join(f'a{i}="1"' for i in range(10**5)) + "/></worldbody>",
     "deep": "<worldbody>" + "<body>" * 10**4 + "</body>" * 10**4 + "</worldbody>",
     "flex": f'<worldbody>{ARM}<flexcomp name="f" type="grid" count="999 999 999" dim="3"/></worldbody>',
-    "texture": f'<asset><texture builtin="flat" width="60000" height="60000"/></asset>',
+    "texture": '<asset><texture builtin="flat" width="60000" height="60000"/></asset>',
     "user data": f'<size nuserdata="2000000000"/><worldbody>{ARM}</worldbody>',
     "includes itself by others": '<include file="next.xml"/>',
     "a pipe as mesh": '<asset><mesh file="pipe.obj"/></asset><worldbody><body><joint axis="0 0 1"/>'
@@ -208,3 +209,26 @@ def test_what_nobody_foresaw_is_one_sentence(capsys, monkeypatch):
         assert err.startswith("jaxpanda: ")
         assert said in err
         assert err.count("\n") == 1
+
+
+def _experiment():
+    file = Path(__file__).parents[1] / "experiments" / "hostile" / "run.py"
+    spec = importlib.util.spec_from_file_location("hostile_run", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("format", ["csv", "npz", "mjcf", "table"])
+def test_a_few_mutated_inputs_of_a_format_are_read_or_refused(format):
+    found = _experiment().work(format, 7, 15)
+    assert set(found["found"]) <= {"accepted", "refused"}, found["examples"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format", ["csv.gz", "parquet", "raw_logs", "corrected", "mass_gravity"])
+def test_many_mutated_inputs_of_a_format_are_read_or_refused(format):
+    found = _experiment().work(format, 8, 60)
+    assert set(found["found"]) <= {"accepted", "refused"}, found["examples"]
