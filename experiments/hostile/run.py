@@ -227,7 +227,7 @@ FORMATS = ("csv", "csv.gz", "npz", "parquet", "raw_logs", "mjcf", "corrected", "
 
 
 def kills(seed: int, count: int) -> dict[str, int]:
-    """`predict` over an earlier result, killed at random times: the old file, or the whole new one."""
+    """`identify` over an earlier result, killed at random times: the old set, or the whole new one."""
     rng, found = random.Random(seed), Counter()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -241,8 +241,8 @@ def kills(seed: int, count: int) -> dict[str, int]:
             with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as child:
                 time.sleep(rng.uniform(0.5, 1.0) * lasts)
                 child.send_signal(rng.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT]))
-            found["whole" if whole(out) else "half-written"] += 1
             found["scratch left"] += sum(path.name.startswith(".jaxpanda.") for path in out.iterdir())
+            found["whole" if whole(out) else "half-written"] += 1
         subprocess.run(command, check=True, capture_output=True)
         found["scratch left at the end"] = sum(path.name.startswith(".jaxpanda.") for path in out.iterdir())
     return dict(found)
