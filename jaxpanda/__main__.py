@@ -11,8 +11,11 @@ import io
 import os
 import re
 import shutil
+import signal
 import sys
 import textwrap
+import threading
+import traceback
 import typing
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -21,7 +24,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from .convention import PLAIN, Convention
-from .errors import InputError
+from .errors import InputError, OutputError, printable
 from .reading import Reading
 
 # Before numpy is imported: its matrices are small here, and threads on them cost more than they save (a
@@ -438,7 +441,7 @@ def _meant(word: str, known: Iterable[str]) -> str:
 
 def _complain(sentence: str) -> None:
     """One line on standard error; on a terminal, broken between words."""
-    line = f"jaxpanda: {sentence}"
+    line = f"jaxpanda: {printable(sentence)}"
     if sys.stderr.isatty():
         width = shutil.get_terminal_size().columns
         line = textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
@@ -454,30 +457,82 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"jaxpanda {__version__}")
         return 0
     try:
-        command = _parse(arguments)
-        if sys.stderr.isatty():  # JAX takes seconds to import
-            print(f"jaxpanda {arguments[0]}: starting", file=sys.stderr, flush=True)
-        from . import session
-
-        session.start()
-        result = command.run()
-        if result is None:  # another process has it
-            return 0
-        if command.json:
-            from .files import to_json
-
-            sys.stdout.write(to_json(result.to_json()))
-        else:
-            from . import report, summaries
-
-            report.to_terminal(summaries.of(result))
+        with _terminable():
+            return _run(arguments)
     except InputError as error:
         _complain(str(error))
         return 2
     except KeyboardInterrupt as stop:
         _complain(f"interrupted; {str(stop) or 'nothing was left half-written'}")
-        return 1
+    except BrokenPipeError:  # who read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    except OutputError as error:
+        _complain(str(error))
+    except Exception as error:
+        if "JAXPANDA_TRACEBACK" in os.environ:
+            raise
+        _complain(_unforeseen(error))
+    return 1
+
+
+def _run(arguments: list[str]) -> int:
+    command = _parse(arguments)
+    if getattr(command, "seed", 0) < 0:
+        raise InputError(f"--seed {command.seed}: a whole number from 0 is needed")
+    if sys.stderr.isatty():  # JAX takes seconds to import
+        print(f"jaxpanda {arguments[0]}: starting", file=sys.stderr, flush=True)
+    from . import inputs, session
+
+    session.start()
+    with inputs.remembered():
+        result = command.run()
+    if isinstance(
+        sys.stdout, io.TextIOWrapper
+    ):  # a file's name may have what the terminal's encoding has not
+        sys.stdout.reconfigure(errors="backslashreplace")
+    if result is None:  # another process has it
+        return 0
+    if command.json:
+        from .files import stamped, to_json
+
+        sys.stdout.write(to_json(stamped(result.to_json())))
+    else:
+        from . import report, summaries
+
+        report.to_terminal(summaries.of(result))
+    sys.stdout.flush()
     return 0
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends a command as Ctrl-C does: what it had begun is cleared away, and that is said."""
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
+def _unforeseen(error: Exception) -> str:
+    """One sentence for what no stage has one for."""
+    said = " ".join(str(error).split())[:300]
+    if isinstance(error, MemoryError):
+        return f"out of memory ({said or 'MemoryError'}); shorter recordings or fewer starts need less"
+    if isinstance(error, OSError):
+        return f"{error.filename or 'the system'}: {error.strerror or said}"
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return (
+        f"{type(error).__name__}: {said} ({Path(frame.filename).name}, line {frame.lineno}): a defect of jaxpanda"
+        " or a library; with JAXPANDA_TRACEBACK=1 in the environment it says where"
+    )
 
 
 if __name__ == "__main__":

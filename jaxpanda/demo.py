@@ -16,7 +16,7 @@ from . import report, summaries
 from .convention import PLAIN, Convention
 from .errors import InputError, require_x64
 from .export import panda_mjcf
-from .files import output_folder
+from .files import Kind, output_folder
 from .identification import Identification, identify
 from .inspection import inspect
 from .mjcf import from_mjcf, standard_from_com
@@ -41,6 +41,7 @@ from .validation import Validation, arm_model, validate
 
 MODEL = "panda.xml"
 REPORT = "report.html"
+_LEAVES = ("validation.json", "identification.json", "retrieval.json", MODEL, REPORT)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +111,8 @@ def demonstrate(
     if not recordings and (convention != PLAIN or reading not in (None, Reading())):
         raise InputError("demo: options that say how to read recordings need --recording")
     arm = arm_of(model, convention.mounting)
-    with output_folder(out) as folder:
+    made = () if recordings else ("recording.csv", "held_out.csv")
+    with output_folder(out, Kind("demo", (*_LEAVES, *made))) as folder:
         if recordings:
             virtual = None
             training = recordings_of(recordings, arm, model=model, reading=reading, convention=convention)

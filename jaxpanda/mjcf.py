@@ -23,7 +23,7 @@ import numpy as np
 from jaxpanda_kernels import Chain
 from jaxtyping import Float
 
-from . import markup
+from . import inputs, markup
 from .arm import KNOWN, Arm
 from .errors import InputError
 
@@ -205,7 +205,11 @@ def _attached(document: markup.Document) -> dict[str, bytes]:
     """Other models that the file attaches parts of."""
     names = [e.attributes.get("file", "") for e in document.root.walk() if e.tag == "model"]
     files = {name: document.path.parent / name for name in names if name}
-    return {name: file.read_bytes() for name, file in files.items() if file.is_file()}
+    return {
+        name: inputs.read_bytes(file, markup.BYTES, f"{document.path}: attaches {name!r}, which")
+        for name, file in files.items()
+        if file.exists()
+    }
 
 
 def _compile(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
@@ -283,6 +287,7 @@ def _check_mesh(spec: mujoco.MjSpec, geom, document: markup.Document) -> None:
             f"{document.path}: body {geom.parent.name!r} takes its inertia from mesh {geom.meshname!r},"
             f" and {file} is missing; put the mesh there or give the body an <inertial>"
         )
+    inputs.require_regular(file)
 
 
 def _serial_joints(model: mujoco.MjModel, path: Path) -> tuple[list[int], list[int]]:

@@ -463,6 +463,20 @@ def test_a_conversion_never_replaces_its_log(capsys, recording, tmp_path):
     assert not (tmp_path / "new.csv").exists()
 
 
+@pytest.mark.parametrize("suffix", ["csv", "csv.gz", "npz", "parquet"])
+def test_a_conversion_replaces_nothing_but_what_it_would_write(capsys, recording, tmp_path, suffix):
+    mine, out = tmp_path / f"mine.{suffix}", tmp_path / f"out.{suffix}"
+    mine.write_text("a user's")
+    (tmp_path / f"link.{suffix}").symlink_to(mine)
+    convert = ["convert", str(recording), "--out"]
+    assert "no earlier result" in refused(capsys, *convert, str(mine))
+    assert "is a link" in refused(capsys, *convert, str(tmp_path / f"link.{suffix}"))
+    assert mine.read_text() == "a user's"
+    assert main([*convert, str(out)]) == main([*convert, str(out)]) == 0
+    capsys.readouterr()
+    assert "no earlier result" in refused(capsys, *convert, str(out), "--to", "2")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -1,6 +1,8 @@
+import dataclasses
 import gzip
 import hashlib
 
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -522,3 +524,36 @@ def test_every_sweep_and_chirp_of_the_iiwa_reads(data):
     runs = load_many(sorted((data / "iiwa").iterdir()))
     assert len(runs) == 14  # one of the 13 folders holds two runs
     assert all(run.dof == 7 and run.qd is not None and run.tau is not None for run in runs)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"tau": np.ones((395, 2))}, r"tau has the shape \(395, 2\), where \(400, 2\) is needed"),
+        ({"qd": np.ones((400, 3))}, "dq has the shape"),
+        ({"q": np.ones(400)}, "q"),
+        ({"time": np.zeros(400)}, "time repeats"),
+        ({"tau": np.full((400, 2), np.inf)}, "column tau_1, row 1: the value is inf"),
+        ({"tau": [["a"]]}, "no array of numbers"),
+    ],
+)
+def test_a_recording_is_valid_by_construction(change, said):
+    """Torque five rows short was "explained"."""
+    whole = {"time": np.arange(400) / 100, "q": np.zeros((400, 2)), "qd": None, "tau": np.zeros((400, 2))}
+    jaxtyping.config.update("jaxtyping_disable", True)  # as it is for users
+    try:
+        with pytest.raises(InputError, match=said):
+            Recording("made.csv", **{**whole, **change})
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def test_units_are_looked_at_wherever_a_recording_came_from():
+    from jaxpanda.signals import prepare
+
+    made = recording(samples=1500)
+    prepare(made)
+    with pytest.raises(InputError, match="looks like degrees"):
+        prepare(dataclasses.replace(made, q=np.rad2deg(made.q) * 8, qd=None))
+    with pytest.raises(InputError, match="looks like milliseconds"):
+        prepare(dataclasses.replace(made, time=1e3 * made.time))

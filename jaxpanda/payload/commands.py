@@ -11,7 +11,7 @@ from ..files import output_folder
 from ..reading import Reading
 from ..recordings import load_many
 from .estimate import estimate_payload
-from .result import MODEL_XML, PayloadEstimate
+from .result import KIND, MODEL_XML, PayloadEstimate
 
 
 def payload_files(
@@ -29,7 +29,7 @@ def payload_files(
     for flag, paths in (("--without", without), ("--with", loaded)):
         if not paths:
             raise InputError(f"{flag}: none given; name at least one file or folder")
-    with output_folder(out):
+    with output_folder(out, KIND) as folder:
         found = estimate_payload(
             model,
             convention.applied(load_many(without, reading), model),
@@ -41,5 +41,5 @@ def payload_files(
         if found.written is not None:
             missing = tuple(f"{MODEL_XML}: {what}" for what in missing_assets(found.written, out))
             found = dataclasses.replace(found, notes=(*found.notes, *missing))
-        found.save(out)  # not by way of a scratch folder: what is included may belong outside of `out`
+        found.save(folder)
     return found

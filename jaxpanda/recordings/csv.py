@@ -69,10 +69,10 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def write_csv(recording: Recording, path: Path) -> None:
-    """The canonical CSV, every number in the shortest form that reads back to the same float64."""
+def csv_bytes(recording: Recording, name: str) -> bytes:
+    """The canonical CSV, packed for a `.gz`; every number in the shortest form that reads back the same."""
     names = canonical_names(recording.dof, recording.qd is not None, recording.tau is not None)
     table = np.column_stack([recording.time, *recording.channels()])
     text = "\n".join([",".join(names), *(",".join(map(repr, row)) for row in table.tolist())]) + "\n"
     content = text.encode()
-    path.write_bytes(gzip.compress(content, mtime=0) if path.name.endswith(".gz") else content)
+    return gzip.compress(content, mtime=0) if name.endswith(".gz") else content

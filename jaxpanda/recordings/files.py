@@ -1,19 +1,18 @@
 """Recordings from files and folders, and back."""
 
 import dataclasses
-import os
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..errors import InputError
+from ..files import write_bytes
 from ..reading import Reading
-from .csv import read_csv, write_csv
+from .csv import csv_bytes, read_csv
 from .hdf5 import read_hdf5
 from .lerobot import INFO, read_lerobot
 from .matlab import read_mat
-from .npz import read_npz, write_npz
-from .parquet import read_parquet, write_parquet
+from .npz import npz_bytes, read_npz
+from .parquet import parquet_bytes, read_parquet
 from .raw_logs import read_raw_logs
 from .recording import Recording
 from .ros import read_bag
@@ -28,10 +27,10 @@ _READERS: Mapping[str, Callable[[Path, Reading], list[Recording]]] = {
     "lerobot": read_lerobot,
     "raw_logs": read_raw_logs,
 }
-_WRITERS: Mapping[str, Callable[[Recording, Path], None]] = {
-    "csv": write_csv,
-    "npz": write_npz,
-    "parquet": write_parquet,
+_WRITERS: Mapping[str, Callable[[Recording, str], bytes]] = {
+    "csv": csv_bytes,
+    "npz": npz_bytes,
+    "parquet": parquet_bytes,
 }
 _TEXT = (".csv", ".txt", ".log", ".dat", ".tsv")
 _SUFFIXES = {
@@ -115,6 +114,16 @@ def save(recording: Recording, path: str | Path) -> None:
     Every number reads back to the same float64. Repairs and notes are not kept in the file.
 
     Raises:
+        InputError: unknown suffix, a folder that does not exist, or `path` is a link or device.
+        OutputError: the disk is full.
+    """
+    write_bytes(path, content_of(recording, path))
+
+
+def content_of(recording: Recording, path: str | Path) -> bytes:
+    """What `save` writes.
+
+    Raises:
         InputError: unknown suffix, or a folder that does not exist.
     """
     path = Path(path)
@@ -123,10 +132,7 @@ def save(recording: Recording, path: str | Path) -> None:
         raise InputError(f"{path.name}: recordings are written as .csv, .csv.gz, .npz or .parquet")
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist")
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".jaxpanda-") as folder:
-        partial = Path(folder) / path.name
-        writer(recording, partial)
-        os.replace(partial, path)
+    return writer(recording, path.name)
 
 
 def _format(path: Path, format: str) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import inputs
 from ..errors import InputError, MissingExtraError
 from ..reading import Reading
 from .recording import Recording
@@ -49,7 +50,7 @@ def read_hdf5(path: Path, reading: Reading) -> list[Recording]:
     """
     refuse(path.name, reading, "topic")
     with opened(path) as file:
-        demos = [name for name in file.get("data", ()) if re.fullmatch(r"demo_\d+", name)]
+        demos = [name for name in _own(file, "data") or () if re.fullmatch(r"demo_\d{1,9}", name)]
         if not demos:
             refuse(path.name, reading, "episode")
             return [recording_of(table_of(path, path.name, file), (DROID,), reading)]
@@ -67,8 +68,17 @@ def table_of(path: Path, name: str, group: Any) -> Table:
     shapes: dict[str, tuple[int, ...]] = {}
 
     def visit(key: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and len(item.shape) in (1, 2):
-            shapes[key] = item.shape
+        if (
+            not isinstance(item, h5py.Dataset)
+            or item.dtype.kind not in "fiu"
+            or len(item.shape) not in (1, 2)
+        ):
+            return
+        if item.external or item.is_virtual:
+            raise InputError(
+                f"{name}: {key} keeps its numbers in another file, which is not read: copy the data into one file"
+            )
+        shapes[key] = item.shape
 
     group.visititems(visit)
     return of_arrays(path, name, shapes, lambda key: group[key][()])
@@ -76,7 +86,7 @@ def table_of(path: Path, name: str, group: Any) -> Table:
 
 def _demonstration(path: Path, file: Any, demo: str, several: bool) -> Table:
     """One demonstration, with time from the control frequency if the file says that."""
-    group, name = file["data"][demo], f"{path.name} (episode {demo[5:]})" if several else path.name
+    group, name = _own(file["data"], demo), f"{path.name} (episode {demo[5:]})" if several else path.name
     table = table_of(path, name, group)
     with contextlib.suppress(KeyError, ValueError, TypeError, AttributeError):
         rate = float(json.loads(file["data"].attrs["env_args"])["env_kwargs"]["control_freq"])
@@ -89,19 +99,27 @@ def _demonstration(path: Path, file: Any, demo: str, several: bool) -> Table:
     return table
 
 
+def _own(group: Any, name: str) -> Any:
+    """What is called so in a group, unless that is a link, which may lead to another file."""
+    h5py = _h5py()
+    link = group.get(name, getlink=True)
+    if link is not None and not isinstance(link, h5py.HardLink):
+        raise InputError(f"{group.file.filename}: {name} is a link, which is not followed")
+    return group.get(name)
+
+
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
     """An HDF5 file, read only; what cannot be read in it ends in one sentence."""
     h5py = _h5py()
     try:
-        with h5py.File(path, "r") as file:
+        with h5py.File(inputs.in_place(path), "r") as file:
             yield file
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
     except InputError:
         raise
-    except (OSError, RuntimeError, KeyError) as error:
-        raise InputError(f"{path.name}: no HDF5, or a broken file ({str(error).splitlines()[0]})") from None
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:
+        said = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"{path.name}: no HDF5, or a broken file ({said})") from None
 
 
 def _h5py() -> ModuleType:

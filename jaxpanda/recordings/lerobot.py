@@ -4,11 +4,11 @@
 `info.json` gives them. Nothing there says in which unit, nor what a torque is.
 """
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
+from .. import inputs
 from ..errors import InputError
 from ..reading import Reading
 from .parquet import read_episodes
@@ -35,11 +35,11 @@ def read_lerobot(path: Path, reading: Reading) -> list[Recording]:
     """
     refuse(path.name, reading, "topic")
     try:
-        info: Any = json.loads((path / INFO).read_text("utf-8"))
+        info = inputs.read_json(path / INFO)
         features = {str(name): dict(feature) for name, feature in info["features"].items()}
         version = str(info.get("codebase_version", ""))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path / INFO}: cannot be read as a LeRobot data set's ({error})") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path / INFO}: is not what a LeRobot data set has there ({error!r})") from None
     single = {
         m[1]: f
         for f in sorted(path.glob("data/*/*.parquet"))

@@ -5,6 +5,9 @@ runs along the longer side of a matrix. Names are free, so `--columns` says whic
 """
 
 import dataclasses
+import io
+import struct
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,7 @@ from typing import Any
 import numpy as np
 import scipy.io
 
+from .. import inputs
 from ..errors import InputError
 from ..reading import Reading
 from .hdf5 import opened, table_of
@@ -30,20 +34,18 @@ def read_mat(path: Path, reading: Reading) -> list[Recording]:
         InputError: no such file, or columns that cannot be told.
     """
     refuse(path.name, reading, "topic", "episode")
-    try:
-        with path.open("rb") as file:
-            start = file.read(1024)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    start = inputs.read_start(path, 1024)
     if start.startswith(b"MATLAB 7.3") or b"\x89HDF\r\n\x1a\n" in start:
         with opened(path) as file:
             table = table_of(path, path.name, file)
             names = [name.replace("/", ".") for name in table.names]
             return [recording_of(dataclasses.replace(table, names=names), (ARRAYS,), reading)]
+    packed = inputs.read_bytes(path)
     try:
-        content = scipy.io.loadmat(path, simplify_cells=True)
+        _require_unpacked(path.name, packed)
+        content = scipy.io.loadmat(io.BytesIO(packed), simplify_cells=True)
+    except InputError:
+        raise
     except Exception as error:  # what a broken file raises is as varied as its parts
         said = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(f"{path.name}: no MATLAB file, or a broken one ({said})") from None
@@ -52,6 +54,25 @@ def read_mat(path: Path, reading: Reading) -> list[Recording]:
         path, path.name, {key: array.shape for key, array in arrays.items()}, arrays.__getitem__
     )
     return [recording_of(table, (ARRAYS,), reading)]
+
+
+def _require_unpacked(name: str, content: bytes) -> None:
+    """Refuse a file of version 7 whose packed variables would fill the memory; others are not packed."""
+    if content[124:128] not in (b"\x00\x01IM", b"\x01\x00MI"):
+        return
+    order = "<II" if content[126:128] == b"IM" else ">II"
+    at, size = 128, 0
+    while at + 8 <= len(content):
+        kind, length = struct.unpack_from(order, content, at)
+        if kind == _PACKED:
+            rest, unpacker = content[at + 8 : at + 8 + length], zlib.decompressobj()
+            while rest and (part := unpacker.decompress(rest, 1 << 20)):
+                size, rest = size + len(part), unpacker.unconsumed_tail
+                inputs.require_unpacked(name, len(content), size)
+        at += 8 + length
+
+
+_PACKED = 15  # miCOMPRESSED of MATLAB's MAT-file format, level 5
 
 
 def _arrays(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:

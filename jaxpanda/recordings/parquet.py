@@ -3,16 +3,19 @@
 A column of lists is `name[0]`, `name[1]`, …; a file of several episodes has a column that numbers them.
 """
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
+from .. import inputs
 from ..errors import InputError, MissingExtraError
 from ..reading import Reading
 from .recording import Recording
-from .table import Source, Table, canonical_names, chosen, recording_of, refuse
+from .table import WIDEST, Source, Table, canonical_names, chosen, recording_of, refuse
 from .voraus import VORAUS
 
 EPISODES = ("episode_index",)
@@ -42,21 +45,15 @@ def read_episodes(
         sources: who writes such data sets.
         reading: what is meant.
     """
-    arrow, parquet = pyarrow()
-    try:
-        schemas = [parquet.read_schema(file) for file in files]
-        names, kept, widths = _columns(arrow, schemas[0], parquet, files[0])
+    with _telling(name):
+        names, kept, widths = _columns(_opened(files[0]))
         marks = [s.episode for s in sources if s.episode and set(s.marks) <= set(names)] or list(EPISODES)
         episode = next((mark for mark in marks if mark in names), "")
-        numbers = [_numbers(parquet, file, episode) for file in files] if episode else []
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, arrow.ArrowException) as error:
-        raise InputError(f"{name}: no Parquet file, or a broken one ({str(error).splitlines()[0]})") from None
+        numbers = [_numbers(file, episode, name) for file in files] if episode else []
     if not episode:
         refuse(name, reading, "episode")
         return [recording_of(_table(files, None, path, name, names, kept, widths), sources, reading)]
-    every = sorted({int(k) for each in numbers for k in np.unique(each)})
+    every = sorted({k for each in numbers for k in np.unique(each).tolist()})
     wanted = chosen(name, [str(k) for k in every], reading)
     out = []
     for number in map(int, wanted):
@@ -66,13 +63,40 @@ def read_episodes(
     return out
 
 
-def _columns(arrow: ModuleType, schema, parquet: ModuleType, file: Path):
+@contextlib.contextmanager
+def _telling(name: str) -> Iterator[None]:
+    """What cannot be read of a file ends in one sentence."""
+    arrow, _ = pyarrow()
+    try:
+        yield
+    except InputError:
+        raise
+    except (OSError, LookupError, arrow.ArrowException) as error:
+        said = " ".join(str(error).split())[:200]
+        raise InputError(f"{name}: no Parquet file, or a broken one ({said})") from None
+
+
+def _opened(file: Path) -> Any:
+    return pyarrow()[1].ParquetFile(inputs.in_place(file))
+
+
+def _content(file: Path, wanted: Sequence[str], name: str) -> Any:
+    """Some columns, once they are found to hold no more numbers than are read; a few bytes may say many."""
+    opened = _opened(file)
+    groups = [opened.metadata.row_group(i) for i in range(opened.metadata.num_row_groups)]
+    chunks = [group.column(i) for group in groups for i in range(group.num_columns)]
+    inside = tuple(f"{column}." for column in wanted)
+    inputs.require_size(name, sum(c.num_values for c in chunks if f"{c.path_in_schema}.".startswith(inside)))
+    return opened.read(list(wanted))
+
+
+def _columns(file: Any) -> tuple[list[str], list[tuple[str, int | None]], dict[str, int]]:
     """Names of all columns, lists taken apart; of each, the column it is in; of each list, its width."""
-    first = None
+    arrow, _ = pyarrow()
     names: list[str] = []
     kept: list[tuple[str, int | None]] = []
     widths: dict[str, int] = {}
-    for field in schema:
+    for field in file.schema_arrow:
         kind = field.type
         if (
             arrow.types.is_list(kind)
@@ -84,9 +108,10 @@ def _columns(arrow: ModuleType, schema, parquet: ModuleType, file: Path):
             if arrow.types.is_fixed_size_list(kind):
                 width = kind.list_size
             else:
-                if first is None:
-                    first = next(parquet.ParquetFile(file).iter_batches(1), None)
-                width = len(first.column(field.name)[0].as_py() or ()) if first is not None else 0
+                first = next(file.iter_batches(1, columns=[field.name]), None)
+                width = 0 if first is None else len(first.column(field.name)[0] or ())
+            if width > WIDEST:
+                continue
             widths[field.name] = width
             names += [f"{field.name}[{k}]" for k in range(width)]
             kept += [(field.name, k) for k in range(width)]
@@ -96,24 +121,30 @@ def _columns(arrow: ModuleType, schema, parquet: ModuleType, file: Path):
     return names, kept, widths
 
 
-def _numbers(parquet: ModuleType, file: Path, episode: str) -> np.ndarray:
-    return parquet.read_table(file, columns=[episode]).column(episode).to_numpy()
+def _numbers(file: Path, episode: str, name: str) -> np.ndarray:
+    """The episode of each row."""
+    arrow, _ = pyarrow()
+    numbers = _array(arrow, _content(file, [episode], name), episode, None, name)
+    if not np.all(np.abs(numbers) < 2**53) or np.any(numbers % 1):
+        raise InputError(f"{name}: column {episode} numbers the episodes, but holds what is no whole number")
+    return numbers.astype(int)
 
 
 def _table(files, rows, path, name, names, kept, widths) -> Table:
     """Columns of some rows of every file; None for all rows."""
 
     def take(places: Sequence[int]) -> np.ndarray:
-        arrow, parquet = pyarrow()
+        arrow, _ = pyarrow()
         wanted = list(dict.fromkeys(kept[i][0] for i in places))
         parts = []
         for k, file in enumerate(files):
             if rows is not None and not len(rows[k]):
                 continue
-            content = parquet.read_table(file, columns=wanted)
-            if rows is not None:
-                content = content.take(arrow.array(rows[k]))
-            arrays = {column: _array(arrow, content, column, widths.get(column), name) for column in wanted}
+            with _telling(name):
+                content = _content(file, wanted, name)
+                if rows is not None:
+                    content = content.take(arrow.array(rows[k]))
+                arrays = {c: _array(arrow, content, c, widths.get(c), name) for c in wanted}
             parts.append(
                 np.column_stack(
                     [arrays[c] if j is None else arrays[c][:, j] for c, j in (kept[i] for i in places)]
@@ -140,14 +171,16 @@ def _array(arrow: ModuleType, content, column: str, width: int | None, name: str
     return flat.reshape(-1, width)
 
 
-def write_parquet(recording: Recording, path: Path) -> None:
+def parquet_bytes(recording: Recording, name: str) -> bytes:
     """The canonical columns, losslessly compressed."""
     arrow, parquet = pyarrow()
     names = canonical_names(recording.dof, recording.qd is not None, recording.tau is not None)
     table = np.column_stack([recording.time, *recording.channels()])
+    out = arrow.BufferOutputStream()
     parquet.write_table(
-        arrow.table({name: table[:, i] for i, name in enumerate(names)}), path, compression="zstd"
+        arrow.table({name: table[:, i] for i, name in enumerate(names)}), out, compression="zstd"
     )
+    return out.getvalue().to_pybytes()
 
 
 def pyarrow() -> tuple[ModuleType, ModuleType]:

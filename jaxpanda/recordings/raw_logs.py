@@ -7,7 +7,7 @@ host stamped: true ticks are reconstructed where they can be and are better (`ti
 import dataclasses
 import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..reading import Reading
 from .checks import checked
 from .recording import Origin, Recording
-from .table import chosen, refuse, within
+from .table import chosen, cut, refuse
 from .text import numbers, read_text
 from .ticks import Ticks, consistent, reconstruct
 
@@ -64,7 +64,7 @@ def read_raw_logs(path: Path, reading: Reading) -> list[Recording]:
         for channel, file in files.items()
     }
     rows = min(map(len, logs.values()))
-    cut = sum(len(log) - rows for log in logs.values())
+    short = sum(len(log) - rows for log in logs.values())
     logs = {channel: log[:rows] for channel, log in logs.items()}
     _same_joints(logs, files)
     stamps = logs["time"][:, 0]
@@ -81,11 +81,9 @@ def read_raw_logs(path: Path, reading: Reading) -> list[Recording]:
             continue
         name = path.name if len(breaks) == 2 else f"{path.name} (run {number})"
         run = {channel: log[start:stop] for channel, log in logs.items()}
-        recording = Recording(
-            name, stamps[start:stop], run["q"], run.get("dq"), run.get("tau"), path, origin=origin
-        )
-        repairs = {"rows cut to the shortest file": cut} if cut else {}
-        runs.append(within(_on_ticks(recording, start, repairs), reading)[0])
+        logged = _Run(name, stamps[start:stop], run["q"], run.get("dq"), run.get("tau"), path, origin)
+        repairs = {"rows cut to the shortest file": short} if short else {}
+        runs.append(cut(_on_ticks(logged, start, repairs), reading))
     return runs
 
 
@@ -199,19 +197,37 @@ def _same_joints(logs: Mapping[str, np.ndarray], files: Mapping[str, Path]) -> N
             )
 
 
-def _on_ticks(recording: Recording, start: int, repairs: dict[str, int]) -> Recording:
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """Rows as they were logged, whose stamps may repeat."""
+
+    name: str
+    time: Float[np.ndarray, " time"]
+    q: Float[np.ndarray, "time dof"]
+    qd: Float[np.ndarray, "time dof"] | None
+    tau: Float[np.ndarray, "time dof"] | None
+    path: Path
+    origin: Origin
+
+    def recording(
+        self, row: Callable[[int], str], repairs: Mapping[str, int], notes: tuple[str, ...] = ()
+    ) -> Recording:
+        channels = (self.time, self.q, self.qd, self.tau)
+        made = Recording(self.name, *channels, self.path, repairs, notes, origin=self.origin, row=row)
+        return checked(made, row)
+
+
+def _on_ticks(run: _Run, start: int, repairs: dict[str, int]) -> Recording:
     """The recording with its rows on true ticks if that is better than the stamps, checked either way."""
     row = lambda i: f"row {start + i + 1}"
-    if recording.qd is None or recording.samples < 40 or consistent(recording.time):
-        return checked(dataclasses.replace(recording, repairs=repairs), row)
-    ticks = reconstruct(recording.time, recording.q, recording.qd, recording.tau)
+    if run.qd is None or len(run.time) < 40 or consistent(run.time):
+        return run.recording(row, repairs)
+    ticks = reconstruct(run.time, run.q, run.qd, run.tau)
     if ticks is None:
-        return checked(dataclasses.replace(recording, repairs=repairs), row)
+        return run.recording(row, repairs)
     evidence = _evidence(ticks)
     if not ticks.better:
-        return checked(
-            dataclasses.replace(recording, repairs=repairs, notes=(f"the stamps are kept: {evidence}",)), row
-        )
+        return run.recording(row, repairs, (f"the stamps are kept: {evidence}",))
     new = np.concatenate([[True], np.diff(ticks.tick) > 0])
     repairs |= {
         "repeated rows dropped": int(np.sum(~new)),
@@ -220,15 +236,15 @@ def _on_ticks(recording: Recording, start: int, repairs: dict[str, int]) -> Reco
         "ticks missing between rows": int(ticks.tick[-1] + 1 - np.sum(new)),
     }
     moved = dataclasses.replace(
-        recording,
+        run,
         time=ticks.tick[new] * ticks.period,
-        q=recording.q[new],
-        qd=recording.qd[new],
-        tau=None if recording.tau is None else recording.tau[new],
-        repairs=repairs,
-        notes=(f"rows are on reconstructed ticks: {evidence}",),
+        q=run.q[new],
+        qd=run.qd[new],
+        tau=None if run.tau is None else run.tau[new],
     )
-    return checked(moved)
+    return moved.recording(
+        lambda i: f"row {i + 1}", repairs, (f"rows are on reconstructed ticks: {evidence}",)
+    )
 
 
 def _evidence(ticks: Ticks) -> str:

@@ -7,6 +7,7 @@ messages have none, when they were received.
 
 import contextlib
 import dataclasses
+import itertools
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from .. import inputs
 from ..errors import InputError, MissingExtraError
 from ..reading import Reading
 from . import ur
 from .recording import Recording, Torque
-from .table import MEASURED, Source, Table, recording_of, refuse
+from .table import COLUMNS, MEASURED, WIDEST, Source, Table, recording_of, refuse
 
 _FRANKA = f"tau_J is the {MEASURED}; tau_J_d is commanded, without gravity"
 _STATES = {
@@ -80,6 +82,7 @@ def read_bag(path: Path, reading: Reading) -> list[Recording]:
     refuse(path.name, reading, "episode")
     with _opened(path) as bag:
         topic, kind = _topic(path, bag, reading)
+        inputs.require_size(path.name, bag.topics[topic].msgcount)
         samples = _samples(bag, topic)
         columns = _columns(samples)
         taken: dict[str, int] = {}
@@ -104,11 +107,9 @@ def _opened(path: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingExtraError("a ROS bag or MCAP", "io") from None
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
     try:
         # sqlite3 bags before 2023 hold no definitions of their messages; these are the standard ones.
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        with AnyReader([inputs.in_place(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
             yield bag
     except InputError:
         raise
@@ -175,7 +176,7 @@ def _columns(samples: Sequence[tuple[int, Any]]) -> dict[str, _Column]:
     """All numbers of a topic's messages."""
     columns = {"stamp": _Column(()), "received": _Column(())}
     for _, message in samples:
-        for name, column in _numbers(message, ()):
+        for name, column in itertools.islice(_numbers(message, ()), COLUMNS + 1):  # more are refused
             columns.setdefault(name, column)
     return columns
 
@@ -192,7 +193,7 @@ def _numbers(message: Any, path: tuple[str, ...]) -> Iterator[tuple[str, _Column
         value, below = getattr(message, field.name), (*path, field.name)
         if dataclasses.is_dataclass(value):
             yield from _numbers(value, below)
-        elif isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
+        elif isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and len(value) <= WIDEST:
             yield from ((f"{'.'.join(below)}[{k}]", _Column(below, k)) for k in range(len(value)))
         elif isinstance(value, int | float) and not isinstance(value, bool):
             yield ".".join(below), _Column(below)

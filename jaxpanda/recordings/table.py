@@ -6,6 +6,7 @@ names merely look like it, the message proposes the option that says so.
 """
 
 import dataclasses
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from .. import inputs
 from ..errors import InputError
 from ..reading import CHANNELS, Reading
 from .checks import SHORTEST, checked
@@ -79,6 +81,11 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
     Raises:
         InputError: columns are missing or cannot be told, or what `checked` refuses.
     """
+    if len(table.names) > COLUMNS:
+        raise InputError(
+            f"{table.name}: {len(table.names)} columns, where at most {COLUMNS} are read: leave out what is no"
+            " joint's"
+        )
     said = reading.channels()
     source = _source(table, sources, said)
     declared = {} if source is None else source.columns
@@ -113,19 +120,21 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
     taken = {
         name: _span([table.names[place] for place in found[name]]) for name in CHANNELS if name in channels
     }
+    rows, cut_notes = within(table.name, time, reading)
+    row = lambda i: table.row(i + rows.start)
     recording = Recording(
         table.name,
-        time,
-        channels["q"],
-        channels.get("dq"),
-        channels.get("tau"),
+        time[rows],
+        channels["q"][rows],
+        channels["dq"][rows] if "dq" in channels else None,
+        channels["tau"][rows] if "tau" in channels else None,
         table.path,
         dict(table.repairs()),
-        (*table.notes, *notes),
+        (*table.notes, *notes, *cut_notes),
         origin=Origin(_named(source, said), taken, torque, says),
+        row=row,
     )
-    recording, first = within(recording, reading)
-    return checked(recording, lambda i: table.row(i + first))
+    return checked(recording, row)
 
 
 def _named(source: Source | None, said: Mapping[str, str]) -> str:
@@ -143,29 +152,35 @@ def _torque(source: Source | None, said: Mapping[str, str]) -> tuple[Torque, str
     return (kind[said["tau"]], WORDS[kind[said["tau"]]]) if said["tau"] in kind else ("unstated", "")
 
 
-def within(recording: Recording, reading: Reading) -> tuple[Recording, int]:
-    """The rows that `--from` and `--to` leave, and how many come before them.
+def within(name: str, time: Float[np.ndarray, " rows"], reading: Reading) -> tuple[slice, tuple[str, ...]]:
+    """The rows from the first to the last that `--from` and `--to` leave, and what to tell of it.
 
     Raises:
         InputError: none is left.
     """
     if reading.whole:
-        return recording, 0
+        return slice(0, len(time)), ()
     low, high = reading.from_, reading.to
-    kept = np.flatnonzero((recording.time >= low) & (recording.time <= high))
-    if not kept.size or np.ptp(recording.time[kept]) < SHORTEST:
-        span = f"{np.min(recording.time):g} to {np.max(recording.time):g}" if recording.samples else "no"
+    kept = np.flatnonzero((time >= low) & (time <= high))
+    if not kept.size or np.ptp(time[kept]) < SHORTEST:
+        span = f"{np.nanmin(time):g} to {np.nanmax(time):g}" if np.any(np.isfinite(time)) else "no"
         raise InputError(
-            f"{recording.name}: {len(kept)} rows between --from {low:g} and --to {high:g} s, where at least"
+            f"{name}: {len(kept)} rows between --from {low:g} and --to {high:g} s, where at least"
             f" {SHORTEST} s are needed; its time goes from {span} s"
         )
-    cut = {
-        name: None if (values := getattr(recording, name)) is None else values[kept]
+    first, last = int(kept[0]), int(kept[-1])
+    said = f"only the rows from {time[first]:g} to {time[last]:g} s: {last + 1 - first} of {len(time)}"
+    return slice(first, last + 1), (said,)
+
+
+def cut(recording: Recording, reading: Reading) -> Recording:
+    """The part of a recording that `--from` and `--to` leave."""
+    rows, notes = within(recording.name, recording.time, reading)
+    parts = {
+        name: None if (values := getattr(recording, name)) is None else values[rows]
         for name in ("time", "q", "qd", "tau", "stamps")
     }
-    said = f"only the rows from {recording.time[kept[0]]:g} to {recording.time[kept[-1]]:g} s: {len(kept)} of"
-    said += f" {recording.samples}"
-    return dataclasses.replace(recording, **cut, notes=(*recording.notes, said)), int(kept[0])
+    return dataclasses.replace(recording, **parts, notes=(*recording.notes, *notes))
 
 
 def chosen(name: str, episodes: Sequence[str], reading: Reading, what: str = "episodes") -> list[str]:
@@ -207,11 +222,13 @@ def of_arrays(
         if len(shape) == 1 or (len(shape) == 2 and 1 in shape):
             names.append(key)
             where.append((key, None))
-        elif len(shape) == 2 and min(shape) <= _WIDEST:
+        elif len(shape) == 2 and min(shape) <= WIDEST:
             names += [f"{key}[{k}]" for k in range(min(shape))]
             where += [(key, k) for k in range(min(shape))]
 
     def take(places: Sequence[int]) -> np.ndarray:
+        for key in dict.fromkeys(where[i][0] for i in places):
+            inputs.require_size(name, math.prod(shapes[key]))
         arrays = {
             key: np.asarray(get(key), dtype=float) for key in dict.fromkeys(where[i][0] for i in places)
         }
@@ -233,8 +250,10 @@ def of_arrays(
     return Table(path, name, names, take, notes=notes)
 
 
-_WIDEST = 1000
+WIDEST = 1000
 """Columns that one array may have."""
+COLUMNS = 5000
+"""Most that a table may have."""
 
 
 def _source(table: Table, sources: Sequence[Source], said: Mapping[str, str]) -> Source | None:
@@ -356,15 +375,15 @@ def _expand(names: Sequence[str], where: str) -> list[str]:
         return [name for part in parts for name in part] if all(parts) else []
     if "+" in where and _second_part(names, where):
         return _expand(names, where.split("+")[0])
-    if m := re.fullmatch(r"(\d+)\.\.(\d+)", where):
-        ranged = [str(k) for k in range(int(m[1]), min(int(m[2]), int(m[1]) + _WIDEST) + 1)]
+    if m := re.fullmatch(r"(\d{1,9})\.\.(\d{1,9})", where):
+        ranged = [str(k) for k in range(int(m[1]), min(int(m[2]), int(m[1]) + WIDEST) + 1)]
         return ranged if set(ranged) <= set(names) else []
-    if m := re.fullmatch(r"(.*)\[(\d*):(\d*)\]", where):
+    if m := re.fullmatch(r"(.*)\[(\d{,9}):(\d{,9})\]", where):
         every = _expand(names, m[1])
         return every[int(m[2] or 0) : int(m[3] or len(every))]
     pattern = (
         re.escape(where if "{j}" in where else where + "[{j}]")
-        .replace(r"\{j\}", r"(\d+)")
+        .replace(r"\{j\}", r"(\d{1,9})")
         .replace(r"\*", ".*")
     )
     found = sorted((int(m[1]), name) for name in names if (m := re.fullmatch(pattern, name)))
@@ -423,7 +442,9 @@ def find_channels(names: Sequence[str], file: str, columns: Mapping[str, str]) -
     found: dict[str, list[int]] = {"time": [seen.index("time")]}
     for channel in ("q", "dq", "tau"):
         joints = {
-            int(m[1]): i for i, name in enumerate(seen) if (m := re.fullmatch(rf"{channel}_(\d+)", name))
+            int(m[1]): i
+            for i, name in enumerate(seen)
+            if (m := re.fullmatch(rf"{channel}_(\d{{1,9}})", name))
         }
         if joints:
             found[channel] = [joints[j] for j in _complete(sorted(joints), channel, file)]
@@ -447,9 +468,9 @@ def _known(name: str) -> bool:
 
 
 def _complete(joints: list[int], channel: str, file: str) -> list[int]:
-    missing = sorted(set(range(1, joints[-1] + 1)) - set(joints))
+    missing = next((j for j, there in enumerate([j for j in joints if j], 1) if j != there), None)
     if missing or joints[0] != 1:
-        name = f"{channel}_{missing[0]}" if missing else f"{channel}_{joints[0]}"
+        name = f"{channel}_{missing or joints[0]}"
         raise InputError(
             f"{file}: column {name} is missing, while {channel}_{joints[-1]} is there"
             if missing
