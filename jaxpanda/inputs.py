@@ -110,9 +110,13 @@ def read_bytes(path: str | Path, most: int = BYTES, where: str = "") -> bytes:
     path = Path(path)
     with os.fdopen(_opened(path, most, where), "rb") as file:
         try:
-            content = file.read(most + 1)
+            size = os.fstat(file.fileno()).st_size  # asked for `most`, Python makes room for that much
+            parts = [file.read(min(size, most) + 1)]
+            while len(parts[-1]) and sum(map(len, parts)) <= most:
+                parts.append(file.read(_CHUNK))
         except OSError as error:
             raise InputError(f"{where or f'{path}:'} cannot be read ({error.strerror})") from None
+    content = b"".join(filter(None, parts))
     if len(content) > most:  # it grew
         _too_large(where or f"{path}:", most)
     return content

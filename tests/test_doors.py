@@ -1,6 +1,7 @@
 """What comes in and what goes out: caps, sets that appear whole, and nothing replaced that is not its own."""
 
 import ast
+import dataclasses
 import json
 import os
 import signal
@@ -9,10 +10,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from test_commands import MODELS, shaken
 
-from jaxpanda import files, inputs
+import jaxpanda
+from jaxpanda import corrected, files, inputs, retrieval, validation
+from jaxpanda.__main__ import main
 from jaxpanda.errors import InputError, OutputError
 from jaxpanda.files import Kind, output_folder, write_json, write_text
+from jaxpanda.identification import result as identification
+from jaxpanda.payload import result as payload
+from jaxpanda.recordings import save
 
 ROOT = Path(__file__).parents[1]
 KIND = Kind("test", ("main.json", "page.html"))
@@ -235,3 +242,85 @@ def test_the_scratch_folder_of_a_process_that_lives_stays(tmp_path):
         other.wait()
     files.settle(tmp_path)
     assert names(tmp_path) == []
+
+
+@pytest.fixture(scope="module")
+def one_folder(tmp_path_factory) -> tuple[Path, list[list[str]]]:
+    """Recordings of a small arm, moving and at rest, and the commands that leave their results in one folder."""
+    folder = tmp_path_factory.mktemp("one")
+    arm = jaxpanda.Arm.from_mjcf(MODELS / "odd_axes.xml")
+    log, out, model = shaken(arm, seconds=4.0), str(folder / "out"), str(MODELS / "odd_axes.xml")
+    still = {"q": log.q[:1] + 0 * log.q, "qd": 0 * log.q, "tau": log.tau[:1] + 1e-3 * log.q}
+    save(log, folder / "arm.csv")
+    save(dataclasses.replace(log, **still), folder / "still.csv")
+    recording = ["--recording", str(folder / "arm.csv")]
+    found, exported = f"{out}/identification.json", f"{out}/found.xml"
+    return folder, [
+        ["identify", *recording, "--model", model, "--folds", "0", "--out", out],
+        ["retrieve", "--identification", found, "--starts", "2", "--out", out],
+        ["export", "--retrieval", out, "--out", exported],
+        ["validate", "--model", exported, *recording, "--no-mjx", "--out", out],
+        ["diagnose", "--model", model, "--recording", str(folder / "still.csv"), "--out", out],
+        ["predict", "--diagnosis", out, *recording, "--out", f"{out}/tau.csv"],
+    ]
+
+
+KINDS = [identification.KIND, retrieval.KIND, validation.KIND, corrected.KIND, payload.KIND]
+
+
+def without_run(folder: Path) -> None:
+    """As versions left results that gave no run an id."""
+    for file in folder.glob("*.json"):
+        document = json.loads(file.read_text())
+        document.pop("run")
+        file.write_text(json.dumps(document))
+
+
+def test_the_results_of_all_commands_fit_into_one_folder(tmp_path):
+    def leave_all(text: str) -> None:
+        for kind in KINDS:
+            with output_folder(tmp_path, kind) as scratch:
+                for name in kind.names:
+                    if name.endswith(".json"):
+                        write_json(scratch / name, {"schema": f"jaxpanda.{kind.command}/1", "text": text})
+                    else:
+                        write_text(scratch / name, f"<head>{text}")
+
+    leave_all("first")
+    leave_all("second")
+    without_run(tmp_path)
+    leave_all("third")
+    assert names(tmp_path) == sorted(name for kind in KINDS for name in kind.names)
+    for file in tmp_path.iterdir():
+        assert "third" in file.read_text()
+        assert file.suffix != ".json" or "run" in json.loads(file.read_text())
+
+
+@pytest.mark.slow
+def test_commands_share_a_folder_and_replace_their_own(one_folder, capsys):
+    folder, commands = one_folder
+    out = folder / "out"
+    for _ in range(2):
+        for command in commands:
+            assert main(command) == 0, capsys.readouterr().err
+    first = names(out)
+    without_run(out)
+    for command in commands:
+        assert main(command) == 0, capsys.readouterr().err
+    assert names(out) == first
+    assert all("run" in json.loads(file.read_text()) for file in out.glob("*.json"))
+
+
+def test_a_true_collision_is_refused_with_status_2(one_folder, capsys):
+    folder, (identify, *_) = one_folder
+    out = folder / "taken"
+    out.mkdir()
+    (out / "identification.json").write_text("a user's")
+    assert main([*identify[:-1], str(out)]) == 2
+    assert "no earlier result of identify" in capsys.readouterr().err
+    assert names(out) == ["identification.json"]
+    document = {"schema": "jaxpanda.identification/1", "run": {"command": "demo"}}
+    (out / "identification.json").write_text(json.dumps(document))
+    assert main([*identify[:-1], str(out)]) == 2
+    assert "is a result of `demo`" in capsys.readouterr().err
+    assert json.loads((out / "identification.json").read_text()) == document

@@ -134,7 +134,6 @@ def material(folder: Path) -> dict[str, Path]:
     out = {name: folder / f"arm.{name}" for name in ("csv", "csv.gz", "npz", "parquet")}
     for path in out.values():
         save(short, path)
-    out |= logs_of_other_tools(short, folder)
     out["raw_logs"] = folder / "raw"
     out["raw_logs"].mkdir()
     for name, channel in (("time", short.time), ("positions", short.q), ("torques", short.tau)):
@@ -158,7 +157,7 @@ def material(folder: Path) -> dict[str, Path]:
     return out
 
 
-def logs_of_other_tools(short: Any, folder: Path) -> dict[str, Path]:
+def logs_of_other_tools(folder: Path) -> dict[str, Path]:
     """The same recording as others write it, by the libraries of their formats."""
     import h5py
     import numpy as np
@@ -168,6 +167,9 @@ def logs_of_other_tools(short: Any, folder: Path) -> dict[str, Path]:
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
+    from jaxpanda.recordings import load
+
+    short = load(folder / "arm.npz")
     arrays = {"time": short.time, "q": short.q, "dq": short.qd, "tau": short.tau}
     out = {name: folder / f"log.{name}" for name in ("mat", "h5")}
     scipy.io.savemat(out["mat"], arrays, do_compression=True)
@@ -242,7 +244,8 @@ def work(format: str, seed: int, count: int) -> dict[str, Any]:
     rng, read, found = random.Random(f"{seed} {format}"), reader(format), Counter()
     examples: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as name:
-        given = material(Path(name))[format]
+        made = material(Path(name))
+        given = (made if format in made else logs_of_other_tools(Path(name)))[format]
         case = Path(name) / "case"
         for number in range(count):
             shutil.rmtree(case, ignore_errors=True)
