@@ -128,7 +128,7 @@ def from_document(document: markup.Document, dropped: frozenset[int] | None = No
     """
     with warnings.catch_warnings(record=True) as said, own_log() as logged:
         warnings.simplefilter("always")
-        spec = _parse(document)
+        spec = parse(document)
         dropped = _drop_looks(spec, document, dropped)
         model = _compile(spec, document.path)
     notes = [f"MuJoCo warns: {what}" for what in dict.fromkeys([*(str(w.message) for w in said), *logged])]
@@ -156,7 +156,7 @@ def load_model(path: str | Path, *, balanceinertia: bool = False) -> mujoco.MjMo
         InputError: no MJCF, or one that MuJoCo refuses.
     """
     document = markup.read(path, "mujoco")
-    spec = _parse(document)
+    spec = parse(document)
     _drop_looks(spec, document)
     spec.compiler.balanceinertia |= balanceinertia
     return _compile(spec, document.path)
@@ -169,10 +169,15 @@ def load_spec(path: str | Path) -> mujoco.MjSpec:
     Raises:
         InputError: no MJCF.
     """
-    return _parse(markup.read(path, "mujoco"))
+    return parse(markup.read(path, "mujoco"))
 
 
-def _parse(document: markup.Document) -> mujoco.MjSpec:
+def parse(document: markup.Document) -> mujoco.MjSpec:
+    """A text as MuJoCo's parser has it, before compilation, with all its meshes.
+
+    Raises:
+        InputError: no MJCF.
+    """
     files = document.includes | _attached(document)
     try:
         spec = mujoco.MjSpec.from_string(document.text, include=files)
