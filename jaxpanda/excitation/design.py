@@ -18,17 +18,16 @@ References:
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import scipy.linalg
-from jaxpanda_kernels import batched
-from jaxpanda_kernels.columns import Geometry, specialise
+from jaxpanda_kernels import Chain, regressor
 from jaxtyping import Array, Float
 
 from ..arm import Arm
@@ -46,10 +45,11 @@ _SAMPLES = 10
 """A period of the highest harmonic."""
 _BETWEEN = 0.02
 """Share of the limits, and of 0.1 m of clearance, kept back for what happens between samples."""
-_OUTER, _INNER = 6, 80
+_OUTER, _INNER = 5, 60
 """Multiplier updates, and L-BFGS steps in each."""
 _PENALTY, _GROWTH = 10.0, 2.0
 """Weight of a squared violation at first, and its growth from update to update."""
+_SOLVER = optx.LBFGS(rtol=1e-4, atol=1e-4)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,11 +109,15 @@ class Task:
 
 
 def rows(
-    geometry: Geometry, independent: Sequence[int], q: Array, qd: Array, qdd: Array
+    chain: Chain, independent: Sequence[int], q: Array, qd: Array, qdd: Array
 ) -> Float[Array, "time dof base"]:
-    """Rows of the base parameters, unweighted."""
-    Y = batched.regressor(geometry, q, qd, qdd)
-    return Y.reshape(*Y.shape[:-2], -1)[..., jnp.asarray(np.array(independent))]
+    """Rows of the base parameters, unweighted.
+
+    Not by `jaxpanda_kernels.batched`: its gradient runs seven times faster, but takes a minute and 3 GB to
+    compile.
+    """
+    Y = jax.vmap(lambda *state: regressor(chain, *state))(q, qd, qdd)
+    return Y.reshape(*Y.shape[:-2], -1)[..., np.array(independent)]
 
 
 def gram(Y: Float[Array, "time dof base"], F: Float[Array, "time dof own"], weight: Float[Array, " dof"]):
@@ -132,42 +136,61 @@ def friction_columns(qd: Array, width: float) -> Float[Array, "time dof own"]:
     return jnp.stack([parts[name] for name in LINEAR[FRICTION]], -1)
 
 
-def objective(task: Task) -> tuple[Callable[[Any], tuple[Array, Array]], int]:
-    """f and g of one start, for `vmap`, and the number of samples."""
-    fourier, limits = task.fourier, task.limits
-    count = 8 * int(np.ceil(_SAMPLES * fourier.harmonics / 8))
-    basis = jnp.asarray(fourier.basis(np.arange(count) * fourier.period / count))
-    geometry = specialise(task.arm.chain)
-    beta, weight = jnp.asarray(task.beta), jnp.asarray(task.sigma**-2.0 * task.independent / count)
-    middle, half = (limits.upper + limits.lower) / 2, (limits.upper - limits.lower) / 2
-    keep = 1 - _BETWEEN
-    prior = jnp.asarray(task.prior)
-    columns = len(prior)
+class Problem(eqx.Module):
+    """A task as arrays, so that what was compiled for one serves the next of the same shape."""
 
-    def evaluate(u: Any) -> tuple[Array, Array]:
-        moved = jnp.einsum("otf,jf->otj", basis, u["x"])
+    arm: Arm
+    independent: tuple[int, ...] = eqx.field(static=True)
+    beta: Float[Array, " base"]
+    basis: Float[Array, "4 time free"]
+    middle: Float[Array, " dof"]
+    half: Float[Array, " dof"]
+    most: Float[Array, "4 dof"]
+    """Of velocity, acceleration, jerk, torque; infinite without a limit."""
+    probes: Probes
+    weight: Float[Array, " dof"]
+    """Of each joint's squared rows [1/(N m)²]."""
+    prior: Float[Array, "columns columns"]
+    criterion: Criterion = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, task: Task) -> "Problem":
+        limits, fourier = task.limits, task.fourier
+        count = 8 * int(np.ceil(_SAMPLES * fourier.harmonics / 8))
+        most = [limits.velocity, limits.acceleration, limits.jerk, limits.torque]
+        return cls(
+            arm=task.arm,
+            independent=task.base.independent,
+            beta=jnp.asarray(task.beta),
+            basis=jnp.asarray(fourier.basis(np.arange(count) * fourier.period / count)),
+            middle=jnp.asarray((limits.upper + limits.lower) / 2),
+            half=jnp.asarray((limits.upper - limits.lower) / 2),
+            most=jnp.asarray(np.stack(most)),
+            probes=task.probes,
+            weight=jnp.asarray(task.sigma**-2.0 * task.independent / count),
+            prior=jnp.asarray(task.prior),
+            criterion=task.criterion,
+        )
+
+    def evaluate(self, u: Mapping[str, Array]) -> tuple[Array, Array]:
+        """f and g of one start."""
+        moved = jnp.einsum("otf,jf->otj", self.basis, u["x"])
         q, qd, qdd, jerk = moved[0] + u["q0"], moved[1], moved[2], moved[3]
-        Y = rows(geometry, task.base.independent, q, qd, qdd)
-        information = prior + gram(Y, friction_columns(qd, _WIDTH), weight)
-        if task.criterion == "logdet":
-            f = -0.5 * jnp.linalg.slogdet(information)[1] / columns
+        Y = rows(self.arm.chain, self.independent, q, qd, qdd)
+        information = self.prior + gram(Y, friction_columns(qd, _WIDTH), self.weight)
+        if self.criterion == "logdet":
+            f = -0.5 * jnp.linalg.slogdet(information)[1] / len(information)
         else:
             s = jnp.linalg.eigvalsh(information)
             f = 0.5 * jnp.log(s[-1] / jnp.maximum(s[0], 1e-14 * s[-1]))
-        tau = Y @ beta + jax.vmap(task.arm.known_torque)(q, qd, qdd)
-        parts = [jnp.abs(q - middle) / half - keep]
-        for value, most in (
-            (qd, limits.velocity),
-            (qdd, limits.acceleration),
-            (jerk, limits.jerk),
-            (tau, limits.torque),
-        ):
-            finite = np.isfinite(most)
-            parts.append(jnp.abs(value[:, finite]) / most[finite] - keep)
-        parts.append((task.probes.shortfall(task.arm.chain, q) + 0.1 * _BETWEEN) / 0.1)
+        tau = Y @ self.beta + jax.vmap(self.arm.known_torque)(q, qd, qdd)
+        keep = 1 - _BETWEEN
+        parts = [
+            jnp.abs(q - self.middle) / self.half - keep,
+            jnp.abs(jnp.stack([qd, qdd, jerk, tau])) / self.most[:, None] - keep,
+            (self.probes.shortfall(self.arm.chain, q) + 0.1 * _BETWEEN) / 0.1,
+        ]
         return f, jnp.concatenate([part.ravel() for part in parts])
-
-    return evaluate, count
 
 
 def starts(task: Task, count: int, seed: int) -> dict[str, Array]:
@@ -204,32 +227,37 @@ def solve(
     tick: Callable[[int, int], None] = lambda done, total: None,
 ) -> Found:
     """Minimise f with g <= 0 from every start at once."""
-    evaluate, _ = objective(task)
-    solver = optx.LBFGS(rtol=1e-4, atol=1e-4)
-
-    def lagrangian(u, args):
-        multipliers, penalty = args
-        f, g = evaluate(u)
-        pushed = jnp.maximum(0.0, multipliers + penalty * g)
-        return f + jnp.sum(pushed**2 - multipliers**2) / (2 * penalty), (f, g)
-
-    @jax.jit
-    @partial(jax.vmap, in_axes=(0, 0, None))
-    def improve(u, multipliers, penalty):
-        args = multipliers, penalty
-        found = optx.minimise(lagrangian, solver, u, args, has_aux=True, max_steps=inner, throw=False)
-        f, g = found.aux  # not evaluated once more: that would be a third of what XLA has to compile
-        return found.value, f, g, jnp.maximum(0.0, multipliers + penalty * g), found.stats["num_steps"]
-
-    u, penalty, evaluations = first, _PENALTY, 0
-    _, g = jax.eval_shape(evaluate, jax.tree.map(lambda x: x[0], first))
+    problem = Problem.of(task)
+    u, penalty, evaluations = first, jnp.asarray(_PENALTY), 0
+    _, g = jax.eval_shape(problem.evaluate, jax.tree.map(lambda x: x[0], first))
     multipliers = jnp.zeros((len(first["q0"]), *g.shape))
     f = g = None
     for k in range(outer):
-        u, f, g, multipliers, steps = improve(u, multipliers, penalty)
+        u, f, g, multipliers, steps = _improve(problem, u, multipliers, penalty, inner)
         evaluations += int(np.max(steps))
-        penalty *= _GROWTH
+        penalty = penalty * _GROWTH
         tick(k + 1, outer)
     assert f is not None
     assert g is not None
     return Found(u, np.asarray(f), np.asarray(g.max(1)), evaluations)
+
+
+@eqx.filter_jit
+def _improve(
+    problem: Problem, u: dict[str, Array], multipliers: Array, penalty: float | Array, steps: int
+) -> tuple[dict[str, Array], Array, Array, Array, Array]:
+    """One round of the augmented Lagrangian for all starts: unknowns, f, g, multipliers and steps taken."""
+
+    def lagrangian(u, args):
+        multipliers, penalty = args
+        f, g = problem.evaluate(u)
+        pushed = jnp.maximum(0.0, multipliers + penalty * g)
+        return f + jnp.sum(pushed**2 - multipliers**2) / (2 * penalty), (f, g)
+
+    def one(u, multipliers):
+        args = multipliers, penalty
+        found = optx.minimise(lagrangian, _SOLVER, u, args, has_aux=True, max_steps=steps, throw=False)
+        f, g = found.aux  # not evaluated once more: that would be a third of what XLA has to compile
+        return found.value, f, g, jnp.maximum(0.0, multipliers + penalty * g), found.stats["num_steps"]
+
+    return jax.vmap(one)(u, multipliers)

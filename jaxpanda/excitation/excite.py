@@ -8,7 +8,6 @@ from pathlib import Path
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxpanda_kernels.columns import specialise
 from jaxtyping import Float
 
 from ..arm import Arm
@@ -157,8 +156,9 @@ def excite(
             )
         first = found.x
         task = dataclasses.replace(task, probes=probes_of(scene, arm, (attempt + 1) * _MORE))
+    why = next((one for one in failed if "come within" in one), failed[-1])
     raise InputError(
-        f"excite: none of {count} starts became a motion that keeps all limits ({failed[0]}); more --starts, "
+        f"excite: none of {count} starts became a motion that keeps all limits ({why}); more --starts, "
         "a smaller --clearance or --margin, or another --seed may help"
     )
 
@@ -198,8 +198,8 @@ def _noise(
         )
     sigma = np.where(np.isfinite(limits.torque), NOISE * limits.torque, _UNLIMITED_NOISE)
     return sigma, (
-        f"torque noise is taken as {100 * NOISE:g} % of each joint's torque limit ({_UNLIMITED_NOISE:g} N m without "
-        "one); --torque-noise or --identification says better"
+        f"torque noise is taken as {100 * NOISE:g} % of each joint's torque limit ({_UNLIMITED_NOISE:g} N m "
+        "without one); --torque-noise or --identification says better"
     )
 
 
@@ -351,7 +351,7 @@ def precision_of(task: Task, trajectory: FourierTrajectory | None) -> Precision:
         period = 2 * np.pi / trajectory.w
         count = round(100 * period)
         q, qd, qdd = (jnp.asarray(x) for x in trajectory(np.arange(count) * period / count))
-        Y = rows(specialise(task.arm.chain), task.base.independent, q, qd, qdd)
+        Y = rows(task.arm.chain, task.base.independent, q, qd, qdd)
         F = friction_columns(qd, 0.0)
         plain = np.asarray(gram(Y, F, jnp.ones(dof)))
         weighted = np.asarray(gram(Y, F, jnp.asarray(task.sigma**-2.0)))

@@ -22,6 +22,7 @@ SLIDING = {"velocity": 0.5, "acceleration": 2.0, "jerk": 20.0}
 """The same of one that slides [m/s, m/s², m/s³]."""
 _REACH = {False: np.pi, True: 0.5}
 """Half range of a joint without a range [rad], of one that slides [m]."""
+_ON_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _SAME = 0.02
 """By which ranges [rad] and frames [-, m] may differ from the Panda's for an arm to be one."""
 
@@ -130,18 +131,14 @@ def actuator_limits(source: MjcfSource) -> Float[np.ndarray, " dof"]:
     for k, link in enumerate(source.links):
         if model.jnt_actfrclimited[link.joint_id]:
             out[k] = np.abs(model.jnt_actfrcrange[link.joint_id]).min()
-        for a in range(model.nu):
-            on_joint = model.actuator_trntype[a] in (
-                mujoco.mjtTrn.mjTRN_JOINT,
-                mujoco.mjtTrn.mjTRN_JOINTINPARENT,
-            )
-            if not on_joint or model.actuator_trnid[a, 0] != link.joint_id:
+        for a in range(model.nactuator):
+            if model.actuator_trntype[a] not in _ON_JOINT or model.actuator_trnid[a, 0] != link.joint_id:
                 continue
             gear = abs(model.actuator_gear[a, 0])
             if model.actuator_forcelimited[a]:
                 out[k] = min(out[k], gear * np.abs(model.actuator_forcerange[a]).min())
-            fixed = model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
-            unbiased = model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
+            fixed = model.actuator_gaintype[a] == int(mujoco.mjtGain.mjGAIN_FIXED)
+            unbiased = model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_NONE)
             if model.actuator_ctrllimited[a] and fixed and unbiased:
                 force = abs(model.actuator_gainprm[a, 0]) * np.abs(model.actuator_ctrlrange[a]).min()
                 out[k] = min(out[k], gear * force)

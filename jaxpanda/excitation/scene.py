@@ -13,6 +13,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -37,23 +38,22 @@ _PLANE, _HFIELD = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HF
 _FLOOR = "floor (assumed)"
 
 
-@dataclasses.dataclass(frozen=True)
-class Probes:
+class Probes(eqx.Module):
     """Spheres of one geom against the rounded box of another; link -1 stands still."""
 
-    link_a: Int[np.ndarray, " probe"]
-    centre: Float[np.ndarray, "probe 3"]
+    link_a: Int[Array, " probe"]
+    centre: Float[Array, "probe 3"]
     """Of the sphere, in the frame of its link [m]."""
-    radius: Float[np.ndarray, " probe"]
-    link_b: Int[np.ndarray, " probe"]
-    R: Float[np.ndarray, "probe 3 3"]
+    radius: Float[Array, " probe"]
+    link_b: Int[Array, " probe"]
+    R: Float[Array, "probe 3 3"]
     """Axes of the box in the frame of its link."""
-    p: Float[np.ndarray, "probe 3"]
-    half: Float[np.ndarray, "probe 3"]
+    p: Float[Array, "probe 3"]
+    half: Float[Array, "probe 3"]
     """[m]"""
-    rounding: Float[np.ndarray, " probe"]
+    rounding: Float[Array, " probe"]
     """[m]"""
-    clearance: float
+    clearance: Float[Array, ""]
     """[m]"""
 
     def shortfall(self, chain: Chain, q: Float[Array, "time dof"]) -> Float[Array, "time probe"]:
@@ -68,7 +68,7 @@ class Probes:
         beyond = jnp.maximum(outside, 0.0)
         length = jnp.sqrt(jnp.sum(beyond**2, -1) + 1e-12)
         inside = jnp.minimum(outside.max(-1), 0.0)
-        return jnp.asarray(self.clearance + self.radius + self.rounding) - length - inside
+        return self.clearance + self.radius + self.rounding - length - inside
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,7 +148,7 @@ class Scene:
                 best = Closest(
                     float(d[least]), f"{self.name(pair.a)} and {self.name(pair.b)}", float(time[k])
                 )
-            due[at] = k + 1 + np.floor(np.maximum(d - best.distance, 0) / (speed * dt)).astype(int)
+            due[at] = k + 1 + np.floor(np.maximum(d - best.distance, 0) / (speed * dt + 1e-12)).astype(int)
         return best
 
 
@@ -264,11 +264,13 @@ def _pairs(scene: Scene, shaped: bool) -> Iterator[Pair]:
 
 
 def _could_touch(scene: Scene, arm: Arm, pairs: list[Pair]) -> tuple[list[Pair], list[str]]:
-    """Without the pairs that are close in nearly every pose: these are built so."""
+    """Without pairs of links that are close in nearly every pose: they are built so."""
     if not pairs:
         return [], []
-    d = _sampled(scene, arm, pairs)
-    close = (d < scene.clearance).mean(0) > _ALWAYS
+    close = (_sampled(scene, arm, pairs) < scene.clearance).mean(0) > _ALWAYS
+    for k, pair in enumerate(pairs):
+        links = [scene.owner[scene.model.geom_bodyid[g]] for g in (pair.a, pair.b)]
+        close[k] &= min(links) >= 0 or max(links) == 0
     built = sorted(
         {f"{scene.name(p.a)} and {scene.name(p.b)}" for p, c in zip(pairs, close, strict=True) if c}
     )
@@ -315,7 +317,7 @@ def probes_of(scene: Scene, arm: Arm, extra: float = 0.0) -> Probes:
         np.array(column, kind).reshape(len(table), *shape)
         for column, kind, shape in zip(columns, kinds, shapes, strict=True)
     ]
-    return Probes(*arrays, clearance=scene.clearance + extra)
+    return Probes(*map(jnp.asarray, arrays), clearance=jnp.asarray(scene.clearance + extra))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -351,9 +353,9 @@ def _boxes(scene: Scene) -> Mapping[int, _Box]:
 
 def _shape(model: mujoco.MjModel, g: int) -> tuple[np.ndarray, float, np.ndarray]:
     """Half sizes, rounding and centre of the rounded box of a geom, in its own frame [m]."""
-    kind, size, zero = model.geom_type[g], model.geom_size[g], np.zeros(3)
+    kind, size, zero = mujoco.mjtGeom(int(model.geom_type[g])), model.geom_size[g], np.zeros(3)
     types = mujoco.mjtGeom
-    if kind == _PLANE:
+    if kind == types.mjGEOM_PLANE:
         return np.array([1e3, 1e3, 1e3]), 0.0, np.array([0, 0, -1e3])
     if kind == types.mjGEOM_SPHERE:
         return zero, float(size[0]), zero
