@@ -388,7 +388,7 @@ def excitation(found: Any) -> Sequence[Section]:
         },
     }
     rows = [
-        [row["expression"], f"{row['nominal']:.4g}", number(row.get("std_before"), 2), f"{row['std']:.2g}"]
+        [row["expression"], f"{row['nominal']:.4g}", number(row.get("std_before"), 2), number(row["std"], 2)]
         for row in document["parameters"]
     ]
     friction = {

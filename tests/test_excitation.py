@@ -107,6 +107,7 @@ def test_coefficients_leave_the_arm_at_rest_where_it_starts(task):
     assert np.abs(trajectory(np.array([1.0]))[1]).min() > 0.01
 
 
+@pytest.mark.slow
 def test_gradients_are_exact(task):
     evaluate = Problem.of(task).evaluate
     u = jax.tree.map(lambda x: x[0], starts(task, 1, 0))

@@ -39,6 +39,8 @@ _MORE = 0.02
 _SMALLER, _TRIES = 0.99, 15
 """Factor on a motion that is a little beyond a limit between the samples it was sought at, and how often."""
 _LEAST_SECONDS = 2.0
+_UNTOLD = 0.01
+"""Share of a parameter's information that is there for numerics only, from which nothing tells it."""
 
 
 def excite(
@@ -114,7 +116,7 @@ def excite(
         fourier,
         sigma,
         2 * CUTOFF * seconds,
-        prior + _weak(sigma, seconds, len(prior)),
+        prior + _weak(sigma, 2 * CUTOFF * seconds) * np.eye(len(prior)),
         criterion,
     )
     first = starts(task, count, seed)
@@ -250,9 +252,9 @@ def _known(
     return information, notes
 
 
-def _weak(sigma: Float[np.ndarray, " dof"], seconds: float, columns: int) -> Float[np.ndarray, "n n"]:
-    """Next to no information, on every column: keeps a joint that hardly moves from being infinitely bad."""
-    return 1e-9 * np.eye(columns) * float(np.mean(sigma**-2.0)) * 2 * CUTOFF * seconds
+def _weak(sigma: Float[np.ndarray, " dof"], independent: float) -> float:
+    """Next to no information on a parameter: keeps a joint that hardly moves from being infinitely bad."""
+    return 1e-9 * float(np.mean(sigma**-2.0)) * independent
 
 
 def _fitted(scene: Scene, task: Task, trajectory: FourierTrajectory) -> FourierTrajectory | str:
@@ -363,7 +365,9 @@ def precision_of(task: Task, trajectory: FourierTrajectory | None) -> Precision:
         }
         information = information + weighted * task.independent / count
     covariance = np.linalg.inv(information)
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    variance = np.maximum(np.diag(covariance), 0.0)
+    untold = variance * _weak(task.sigma, task.independent) > _UNTOLD
+    std = np.where(untold, np.inf, np.sqrt(variance))
     friction = std[rank:].reshape(dof, own)
     return Precision(
         std[:rank],

@@ -53,7 +53,7 @@ class Precision:
     """What recordings of a motion would tell."""
 
     base: Float[np.ndarray, " base"]
-    """Standard deviation of each base parameter, in its unit."""
+    """Standard deviation of each base parameter, in its unit; infinite where nothing tells it."""
     friction: Mapping[str, Float[np.ndarray, " dof"]]
     """Of each friction parameter."""
     conditions: Mapping[str, float]
@@ -103,8 +103,8 @@ class Excitation:
                 "expression": text,
                 "terms": terms,
                 "nominal": float(nominal),
-                "std": float(self.precision.base[i]),
-                **({} if known is None else {"std_before": finite(_told(known.base[i]))}),
+                "std": finite(self.precision.base[i]),
+                **({} if known is None else {"std_before": finite(known.base[i])}),
             }
             for i, (text, terms, nominal) in enumerate(
                 zip(self.base.expressions, self.base.terms, self._nominal(), strict=True)
@@ -113,7 +113,7 @@ class Excitation:
         friction = [
             {
                 "joint": j + 1,
-                "std": {name: float(values[j]) for name, values in self.precision.friction.items()},
+                "std": {name: finite(values[j]) for name, values in self.precision.friction.items()},
             }
             for j in range(self.arm.dof)
         ]
@@ -206,8 +206,3 @@ class Excitation:
             "end",
         ]
         return "\n".join(lines) + "\n"
-
-
-def _told(std: float) -> float:
-    """Infinite where next to nothing was known."""
-    return std if std < 1e3 else np.inf
