@@ -1,21 +1,23 @@
 """What a designed motion tells about a Panda, against Gaz et al.'s motion and random ones."""
 
 import argparse
-import dataclasses
 import json
 import time
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxpanda.arm import Arm
 from jaxpanda.excitation import excite
+from jaxpanda.excitation.design import friction_columns, gram, rows
 from jaxpanda.export import panda_mjcf
 from jaxpanda.identification import identify
 from jaxpanda.mjcf import standard_from_com
 from jaxpanda.panda import published
+from jaxpanda.parameters import arm_base_parameters
 from jaxpanda.simulation import (
     FourierTrajectory,
     JointFriction,
@@ -49,6 +51,8 @@ def main() -> None:
         )
     model = panda_mjcf()
     motions |= {f"random Fourier {k + 1}": random_trajectory(model, k) for k in range(options.random)}
+    for name, motion in motions.items():
+        print(f"{name}: condition numbers {conditions(motion)}", flush=True)
     results = {name: [one(seed, motion) for seed in range(options.arms)] for name, motion in motions.items()}
     table(results)
     if options.out:
@@ -58,6 +62,18 @@ def main() -> None:
 def gaz() -> FourierTrajectory:
     motion = published()["exciting_trajectory"]
     return fourier_trajectory(**{name: motion[name] for name in ("a", "b", "q0")})
+
+
+def conditions(motion: FourierTrajectory) -> tuple[float, float]:
+    """Of the regressor along a motion, all joints alike: base parameters; with friction columns."""
+    arm = Arm.panda()
+    base = arm_base_parameters(arm)
+    q, qd, qdd = (jnp.asarray(x) for x in motion(np.arange(0, SECONDS, 0.01)))
+    Y = rows(arm.chain, base.independent, q, qd, qdd)
+    together = np.asarray(gram(Y, friction_columns(qd, 0.0), jnp.ones(arm.dof)))
+    parts = together[: base.rank, : base.rank], together
+    rigid, whole = (round(float(np.sqrt(np.linalg.cond(part))), 1) for part in parts)
+    return rigid, whole
 
 
 def one(seed: int, motion: FourierTrajectory) -> dict[str, Any]:
@@ -74,7 +90,6 @@ def one(seed: int, motion: FourierTrajectory) -> dict[str, Any]:
     beta = found.projection @ standard[-arm.dof :].ravel()
     assert found.std is not None
     assert found.condition_number is not None
-    print(dataclasses.asdict(motion)["w"], seed, round(found.condition_number, 1), flush=True)
     return {
         "condition_number": found.condition_number,
         "std": found.std.tolist(),
