@@ -177,6 +177,7 @@ def scene_of(
             ("collisions were not checked",),
         )
     notes: list[str] = []
+    assumed = ""
     with own_log():
         spec = parse(source.document)
         shaped = _shapes(spec, arm, source, notes)
@@ -184,9 +185,7 @@ def scene_of(
             spec.worldbody.add_geom(
                 name=_FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, floor]
             )
-            notes.append(
-                f"a floor is assumed at z = {floor:g} m; --floor says another height, --no-floor none"
-            )
+            assumed = f"a floor is assumed at z = {floor:g} m; --floor says another height, --no-floor none"
         try:
             model = spec.compile()
         except ValueError as error:
@@ -198,6 +197,8 @@ def scene_of(
     owner = _owners(model, source)
     whole = Scene(model, source, (), owner, clearance, ())
     pairs, more = _could_touch(whole, arm, list(_pairs(whole, shaped)))
+    if assumed and pairs:
+        more.append(assumed)
     if any(model.geom_type[g] == _HFIELD for g in range(model.ngeom)):
         more.append("height fields are not checked")
     return dataclasses.replace(whole, pairs=tuple(pairs), notes=(*notes, *more))
