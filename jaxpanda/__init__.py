@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .diagnosis import diagnose as diagnose
     from .diagnosis import predict as predict
     from .errors import InputError as InputError
+    from .excitation import excite as excite
     from .feasible import Bounds as Bounds
     from .identification import Identification as Identification
     from .identification import identify as identify
@@ -53,6 +54,7 @@ _HOME = {
     "demonstrate": "demo",
     "diagnose": "diagnosis",
     "estimate_payload": "payload",
+    "excite": "excitation",
     "predict": "diagnosis",
     "identify": "identification",
     "identify_mass_gravity": "identification",

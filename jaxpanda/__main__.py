@@ -340,7 +340,90 @@ class Convert:
         return pipeline.convert_file(self.file, self.out, self.read, self.convention)
 
 
-_COMMANDS = (Demo, Inspect, Identify, Retrieve, Export, Validate, Diagnose, Predict, Payload, Convert)
+@dataclasses.dataclass(frozen=True)
+class Excite:
+    """The motion to record: it tells base parameters and friction best, within limits and without collision."""
+
+    out: Path
+    """Folder for excitation.json, excitation.csv, joint_trajectory.yaml; for six joints excitation.script."""
+    model: Path | None = None
+    """The arm, perhaps in its scene (MJCF); without it, the project's own Panda."""
+    seconds: float = 20.0
+    """Length of the motion, which starts and ends at rest and can be repeated."""
+    identification: Path | None = None
+    """What an earlier `identify` knows: the new motion asks for the rest."""
+    criterion: Literal["logdet", "condition"] = "logdet"
+    """The parameters' standard deviations, or the condition number; joints weighted by their torque noise."""
+    rate: float = 1000.0
+    """Of excitation.csv [Hz]."""
+    highest_frequency: float = 0.5
+    """Of the motion [Hz]."""
+    velocity: tuple[float, ...] = ()
+    """Limits, one for all joints or one a joint [rad/s]; without them what is published for the arm, or a guess
+    that is told. Ranges are the model's."""
+    acceleration: tuple[float, ...] = ()
+    """[rad/s²]"""
+    jerk: tuple[float, ...] = ()
+    """[rad/s³]"""
+    torque: tuple[float, ...] = ()
+    """[N m]; without it the actuators'."""
+    torque_noise: tuple[float, ...] = ()
+    """Rms of what a fit leaves of torque below 5 Hz, one for all joints or one a joint [N m]."""
+    share: float = 0.9
+    """Of the limits that the motion may use."""
+    margin: float = 0.05
+    """To the ends of the joints' ranges [rad, m]."""
+    clearance: float = 0.05
+    """To keep from itself, the floor and the scene [m]."""
+    floor: float = 0.0
+    """Height of the floor, where the model has none [m]."""
+    no_floor: bool = False
+    """There is no floor."""
+    no_collisions: bool = False
+    """Do not look for collisions."""
+    starts: int = 8
+    """Random motions to start from."""
+    seed: int = 0
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import excitation
+
+        limits = {name: getattr(self, name) for name in ("velocity", "acceleration", "jerk", "torque")}
+        return excitation.excite_files(
+            self.out,
+            self.model,
+            limits,
+            seconds=self.seconds,
+            rate=self.rate,
+            highest_frequency=self.highest_frequency,
+            criterion=self.criterion,
+            identification=self.identification,
+            torque_noise=self.torque_noise,
+            share=self.share,
+            margin=self.margin,
+            clearance=self.clearance,
+            floor=None if self.no_floor else self.floor,
+            collisions=not self.no_collisions,
+            count=self.starts,
+            seed=self.seed,
+        )
+
+
+_COMMANDS = (
+    Demo,
+    Inspect,
+    Identify,
+    Retrieve,
+    Export,
+    Validate,
+    Diagnose,
+    Predict,
+    Payload,
+    Convert,
+    Excite,
+)
 
 
 def _parse(arguments: list[str]) -> Any:

@@ -190,6 +190,23 @@ def load_spec(path: str | Path) -> mujoco.MjSpec:
     return _parse(markup.read(path, "mujoco"))
 
 
+def with_shapes(document: markup.Document) -> mujoco.MjSpec:
+    """A text as MuJoCo's parser has it, before compilation, with its meshes and height fields but no pictures.
+
+    Raises:
+        InputError: no MJCF, or a mesh that is no regular file.
+    """
+    spec = _parse(document)
+    for skin in list(spec.skins):
+        spec.delete(skin)
+    _drop_pictures(spec)
+    for asset in [*spec.meshes, *spec.hfields]:
+        file = document.path.parent / spec.meshdir / asset.file
+        if asset.file and file.exists():
+            inputs.require_regular(file)
+    return spec
+
+
 def _parse(document: markup.Document) -> mujoco.MjSpec:
     files = document.includes | _attached(document)
     try:
@@ -251,13 +268,17 @@ def _drop_looks(
     meshes = [mesh for mesh in spec.meshes if (mesh.name or Path(mesh.file).stem) not in kept]
     for unused in [*meshes, *spec.hfields, *spec.skins]:
         spec.delete(unused)
+    _drop_pictures(spec)
+    return dropped
+
+
+def _drop_pictures(spec: mujoco.MjSpec) -> None:
     for texture in spec.textures:
         if texture.builtin == mujoco.mjtBuiltin.mjBUILTIN_NONE:
             texture.file, texture.builtin = "", mujoco.mjtBuiltin.mjBUILTIN_FLAT
             texture.width = texture.height = 2
             for i in range(len(texture.cubefiles)):
                 texture.cubefiles[i] = ""
-    return dropped
 
 
 def _gives_inertia(spec: mujoco.MjSpec, geom) -> bool:

@@ -16,6 +16,7 @@ import jaxpanda
 from jaxpanda import corrected, files, inputs, retrieval, validation
 from jaxpanda.__main__ import main
 from jaxpanda.errors import InputError, OutputError
+from jaxpanda.excitation import result as excitation
 from jaxpanda.files import Kind, output_folder, write_json, write_text
 from jaxpanda.identification import result as identification
 from jaxpanda.payload import result as payload
@@ -265,7 +266,7 @@ def one_folder(tmp_path_factory) -> tuple[Path, list[list[str]]]:
     ]
 
 
-KINDS = [identification.KIND, retrieval.KIND, validation.KIND, corrected.KIND, payload.KIND]
+KINDS = [identification.KIND, retrieval.KIND, validation.KIND, corrected.KIND, payload.KIND, excitation.KIND]
 
 
 def without_run(folder: Path) -> None:
