@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .diagnosis import diagnose as diagnose
     from .diagnosis import predict as predict
     from .errors import InputError as InputError
+    from .excitation import excite as excite
     from .feasible import Bounds as Bounds
     from .identification import Identification as Identification
     from .identification import identify as identify
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from .inspection import inspect as inspect
     from .payload import estimate_payload as estimate_payload
     from .pipeline import to_mjcf as to_mjcf
+    from .reading import Reading as Reading
     from .recordings import Recording as Recording
     from .recordings import load as load
     from .recordings import save as save
@@ -46,11 +48,13 @@ _HOME = {
     "Diagnosis": "diagnosis",
     "Identification": "identification",
     "InputError": "errors",
+    "Reading": "reading",
     "Recording": "recordings",
     "Retrieval": "retrieval",
     "demonstrate": "demo",
     "diagnose": "diagnosis",
     "estimate_payload": "payload",
+    "excite": "excitation",
     "predict": "diagnosis",
     "identify": "identification",
     "identify_mass_gravity": "identification",

@@ -11,8 +11,12 @@ import io
 import os
 import re
 import shutil
+import signal
 import sys
 import textwrap
+import threading
+import traceback
+import typing
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,14 +24,17 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from .convention import PLAIN, Convention
-from .errors import InputError
-
-_Convention = Annotated[Convention, tyro.conf.arg(name="")]
-"""Options of every command that reads recordings with torque."""
+from .errors import InputError, OutputError, printable
+from .reading import Reading
 
 # Before numpy is imported: its matrices are small here, and threads on them cost more than they save (a
 # diagnosis takes half the time without).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+_Read = Annotated[Reading, tyro.conf.arg(name="")]
+_Convention = Annotated[Convention, tyro.conf.arg(name="")]
+"""Options of every command that reads recordings: which part of a log is read, then what its columns mean."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,12 +44,14 @@ class Demo:
     out: Path
     """Folder for panda.xml, report.html and what the other commands leave."""
     recording: tuple[Path, ...] = ()
-    """Recordings (CSV, .npz, .parquet or a folder of raw logs); without any, a virtual Panda is recorded."""
+    """Recordings (any log that docs/files.md lists); without any, a virtual Panda is recorded."""
     model: Path | None = None
     """The simulation as you have it (MJCF); without it, the project's own Panda."""
     starts: int = 2048
     """Random starts of the retrieval."""
     seed: int = 0
+    read: _Read = dataclasses.field(default_factory=Reading)
+    convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -50,7 +59,13 @@ class Demo:
         from .demo import demonstrate
 
         return demonstrate(
-            self.out, recordings=self.recording, model=self.model, starts=self.starts, seed=self.seed
+            self.out,
+            recordings=self.recording,
+            model=self.model,
+            starts=self.starts,
+            seed=self.seed,
+            reading=self.read,
+            convention=self.convention,
         )
 
 
@@ -62,6 +77,7 @@ class Inspect:
     """Recordings to look at."""
     model: Path | None = None
     """The arm (MJCF); without it, the project's own Panda."""
+    read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
@@ -69,7 +85,7 @@ class Inspect:
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.inspect_files(self.recording, self.model, self.convention)
+        return pipeline.inspect_files(self.recording, self.model, self.read, self.convention)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +111,7 @@ class Identify:
     """Of the zero-phase low-pass on regressor and torque alike [Hz]."""
     folds: int = 5
     """Of the phase-blocked cross-validation."""
+    read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
@@ -112,6 +129,7 @@ class Identify:
             weighting=self.weighting,
             cutoff=self.cutoff,
             folds=self.folds,
+            reading=self.read,
             convention=self.convention,
         )
 
@@ -191,6 +209,7 @@ class Validate:
     """Of the zero-phase low-pass on both torques [Hz]."""
     no_mjx: bool = False
     """Leave MJX out, which takes most of the time on a CPU; roll-outs are then C MuJoCo's alone."""
+    read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
@@ -204,6 +223,7 @@ class Validate:
             self.recording,
             cutoff=self.cutoff,
             in_mjx=not self.no_mjx,
+            reading=self.read,
             convention=self.convention,
         )
 
@@ -222,6 +242,7 @@ class Diagnose:
     """Recordings of the same arm from when nothing was wrong."""
     knowledge: Literal["exact", "identified", "rough", "unknown"] = "identified"
     """How well the numbers in the model are known."""
+    read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
@@ -230,7 +251,13 @@ class Diagnose:
         from . import diagnosis
 
         return diagnosis.diagnose_files(
-            self.out, self.model, self.recording, self.reference, self.knowledge, self.convention
+            self.out,
+            self.model,
+            self.recording,
+            self.reference,
+            self.knowledge,
+            reading=self.read,
+            convention=self.convention,
         )
 
 
@@ -244,13 +271,17 @@ class Predict:
     """The motion: a recording, with or without torque."""
     out: Path
     """The CSV to write."""
+    read: _Read = dataclasses.field(default_factory=Reading)
+    convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
         from . import diagnosis
 
-        return diagnosis.predict_files(self.diagnosis, self.recording, self.out)
+        return diagnosis.predict_files(
+            self.diagnosis, self.recording, self.out, reading=self.read, convention=self.convention
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,6 +301,7 @@ class Payload:
     called a flange, else the last link's body."""
     torque_scale_std: float = 0.0
     """By which share all torques may be off together, as 0.1 for motor currents times gains known to 10 %."""
+    read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
@@ -284,11 +316,114 @@ class Payload:
             self.with_,
             frame=self.frame,
             torque_scale_std=self.torque_scale_std,
+            reading=self.read,
             convention=self.convention,
         )
 
 
-_COMMANDS = (Demo, Inspect, Identify, Retrieve, Export, Validate, Diagnose, Predict, Payload)
+@dataclasses.dataclass(frozen=True)
+class Convert:
+    """Write a log of any kind as the canonical CSV."""
+
+    file: tyro.conf.Positional[Path]
+    """The log: file or folder."""
+    out: Path
+    """The CSV to write; .csv.gz, .npz and .parquet too, by the name."""
+    read: _Read = dataclasses.field(default_factory=Reading)
+    convention: _Convention = PLAIN
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import pipeline
+
+        return pipeline.convert_file(self.file, self.out, self.read, self.convention)
+
+
+@dataclasses.dataclass(frozen=True)
+class Excite:
+    """The motion to record: it tells base parameters and friction best, within limits and without collision."""
+
+    out: Path
+    """Folder for excitation.json, excitation.csv, joint_trajectory.yaml; for six joints excitation.script."""
+    model: Path | None = None
+    """The arm, perhaps in its scene (MJCF); without it, the project's own Panda."""
+    seconds: float = 20.0
+    """Length of the motion, which starts and ends at rest and can be repeated."""
+    identification: Path | None = None
+    """What an earlier `identify` knows: the new motion asks for the rest."""
+    criterion: Literal["logdet", "condition"] = "logdet"
+    """The parameters' standard deviations, or the condition number; joints weighted by their torque noise."""
+    rate: float = 1000.0
+    """Of excitation.csv [Hz]."""
+    highest_frequency: float = 0.5
+    """Of the motion [Hz]."""
+    velocity: tuple[float, ...] = ()
+    """Limits, one for all joints or one a joint [rad/s]; without them what is published for the arm, or a guess
+    that is told. Ranges are the model's."""
+    acceleration: tuple[float, ...] = ()
+    """[rad/s²]"""
+    jerk: tuple[float, ...] = ()
+    """[rad/s³]"""
+    torque: tuple[float, ...] = ()
+    """[N m]; without it the actuators'."""
+    torque_noise: tuple[float, ...] = ()
+    """Rms of what a fit leaves of torque below 5 Hz, one for all joints or one a joint [N m]."""
+    share: float = 0.9
+    """Of the limits that the motion may use."""
+    margin: float = 0.05
+    """To the ends of the joints' ranges [rad, m]."""
+    clearance: float = 0.05
+    """To keep from itself, the floor and the scene [m]."""
+    floor: float = 0.0
+    """Height of the floor, where the model has none [m]."""
+    no_floor: bool = False
+    """There is no floor."""
+    no_collisions: bool = False
+    """Do not look for collisions."""
+    starts: int = 8
+    """Random motions to start from."""
+    seed: int = 0
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import excitation
+
+        limits = {name: getattr(self, name) for name in ("velocity", "acceleration", "jerk", "torque")}
+        return excitation.excite_files(
+            self.out,
+            self.model,
+            limits,
+            seconds=self.seconds,
+            rate=self.rate,
+            highest_frequency=self.highest_frequency,
+            criterion=self.criterion,
+            identification=self.identification,
+            torque_noise=self.torque_noise,
+            share=self.share,
+            margin=self.margin,
+            clearance=self.clearance,
+            floor=None if self.no_floor else self.floor,
+            collisions=not self.no_collisions,
+            count=self.starts,
+            seed=self.seed,
+        )
+
+
+_COMMANDS = (
+    Demo,
+    Inspect,
+    Identify,
+    Retrieve,
+    Export,
+    Validate,
+    Diagnose,
+    Predict,
+    Payload,
+    Convert,
+    Excite,
+)
 
 
 def _parse(arguments: list[str]) -> Any:
@@ -324,8 +459,10 @@ def _sentence(arguments: list[str], panel: str) -> str:
         known = [*commands, "--help", "--version"]
         what = f"no command {name!r}{_meant(name, known)}" if name else "no command given"
         return f"{what}; there are {', '.join(commands)}: see jaxpanda --help"
-    fields = {"--" + field.name.rstrip("_").replace("_", "-"): field for field in _fields(commands[name])}
+    fields = dict(_spelled(commands[name]))
     given = _options(arguments)
+    if arguments[1:] and not arguments[1].startswith("-"):  # what stands first without an option
+        given += [field for field in fields if field.isupper()]
     words = " ".join(line.strip("╭╮╰╯│─+|- ") for line in panel.splitlines())  # a frame, of lines or of ASCII
     text = " ".join(re.sub(r"[-─]{3,}", " ", words).split())
     unknown = [option for option in given if option not in fields]
@@ -352,11 +489,16 @@ def _sentence(arguments: list[str], panel: str) -> str:
     return f"{what}; see jaxpanda {name} --help"
 
 
-def _fields(command: Any) -> Iterator[dataclasses.Field[Any]]:
-    """The options of a command, those that it shares with others included."""
+def _spelled(command: Any) -> Iterator[tuple[str, dataclasses.Field[Any]]]:
+    """Every field of a command as it is written, those of options that it shares with others included."""
     for field in dataclasses.fields(command):
-        shared = dataclasses.is_dataclass(field.default)
-        yield from _fields(field.default) if shared else [field]
+        kind, *marks = typing.get_args(field.type) or (field.type,)
+        if dataclasses.is_dataclass(kind):
+            yield from _spelled(kind)
+        elif tyro.conf.Positional in marks:
+            yield field.name.upper(), field
+        else:
+            yield "--" + field.name.rstrip("_").replace("_", "-"), field
 
 
 def _options(arguments: list[str]) -> list[str]:
@@ -382,7 +524,7 @@ def _meant(word: str, known: Iterable[str]) -> str:
 
 def _complain(sentence: str) -> None:
     """One line on standard error; on a terminal, broken between words."""
-    line = f"jaxpanda: {sentence}"
+    line = f"jaxpanda: {printable(sentence)}"
     if sys.stderr.isatty():
         width = shutil.get_terminal_size().columns
         line = textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
@@ -398,30 +540,82 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"jaxpanda {__version__}")
         return 0
     try:
-        command = _parse(arguments)
-        if sys.stderr.isatty():  # JAX takes seconds to import
-            print(f"jaxpanda {arguments[0]}: starting", file=sys.stderr, flush=True)
-        from . import session
-
-        session.start()
-        result = command.run()
-        if result is None:  # another process has it
-            return 0
-        if command.json:
-            from .files import to_json
-
-            sys.stdout.write(to_json(result.to_json()))
-        else:
-            from . import report, summaries
-
-            report.to_terminal(summaries.of(result))
+        with _terminable():
+            return _run(arguments)
     except InputError as error:
         _complain(str(error))
         return 2
     except KeyboardInterrupt as stop:
         _complain(f"interrupted; {str(stop) or 'nothing was left half-written'}")
-        return 1
+    except BrokenPipeError:  # who read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    except OutputError as error:
+        _complain(str(error))
+    except Exception as error:
+        if "JAXPANDA_TRACEBACK" in os.environ:
+            raise
+        _complain(_unforeseen(error))
+    return 1
+
+
+def _run(arguments: list[str]) -> int:
+    command = _parse(arguments)
+    if getattr(command, "seed", 0) < 0:
+        raise InputError(f"--seed {command.seed}: a whole number from 0 is needed")
+    if sys.stderr.isatty():  # JAX takes seconds to import
+        print(f"jaxpanda {arguments[0]}: starting", file=sys.stderr, flush=True)
+    from . import inputs, session
+
+    session.start()
+    with inputs.remembered():
+        result = command.run()
+    if isinstance(
+        sys.stdout, io.TextIOWrapper
+    ):  # a file's name may have what the terminal's encoding has not
+        sys.stdout.reconfigure(errors="backslashreplace")
+    if result is None:  # another process has it
+        return 0
+    if command.json:
+        from .files import stamped, to_json
+
+        sys.stdout.write(to_json(stamped(result.to_json())))
+    else:
+        from . import report, summaries
+
+        report.to_terminal(summaries.of(result))
+    sys.stdout.flush()
     return 0
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends a command as Ctrl-C does: what it had begun is cleared away, and that is said."""
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
+def _unforeseen(error: Exception) -> str:
+    """One sentence for what no stage has one for."""
+    said = " ".join(str(error).split())[:300]
+    if isinstance(error, MemoryError):
+        return f"out of memory ({said or 'MemoryError'}); shorter recordings or fewer starts need less"
+    if isinstance(error, OSError):
+        return f"{error.filename or 'the system'}: {error.strerror or said}"
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return (
+        f"{type(error).__name__}: {said} ({Path(frame.filename).name}, line {frame.lineno}): a defect of jaxpanda"
+        " or a library; with JAXPANDA_TRACEBACK=1 in the environment it says where"
+    )
 
 
 if __name__ == "__main__":

@@ -90,14 +90,30 @@ class Arm(eqx.Module):
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> "Arm":
         """The inverse of `to_json`; a document that is none raises LookupError, TypeError or ValueError."""
+        names = [tuple(document[key]) for key in ("joint_names", "link_names")]
+        dof = len(names[0])
+        if (
+            dof == 0
+            or len(names[1]) != dof
+            or not all(isinstance(one, str) for every in names for one in every)
+        ):
+            raise ValueError("joint_names and link_names must be as many texts as there are joints")
+        shapes = {"R": (dof, 3, 3), "p": (dof, 3), "prismatic": (dof,), "gravity": (3,)}
+        for name, shape in shapes.items():
+            values = np.asarray(document["chain"][name])
+            if values.shape != shape or values.dtype == object or not np.isfinite(values).all():
+                raise ValueError(f"chain: {name} must hold {' x '.join(map(str, shape))} numbers")
+        for name, shape in {"lumped": (dof, 10), **dict.fromkeys(FRICTION_LAW, (dof,))}.items():
+            if document.get(name) is not None and np.asarray(document[name], float).shape != shape:
+                raise ValueError(f"{name} must hold {' x '.join(map(str, shape))} numbers")
         R, p, prismatic, gravity = (document["chain"][name] for name in _CHAIN)
         chain = Chain(jnp.asarray(R), jnp.asarray(p), jnp.asarray(prismatic, bool), jnp.asarray(gravity))
         return cls(
             chain,
             **{name: jnp.asarray(_unlisted(document[name], name)) for name in NUMBERS},
-            joint_names=tuple(document["joint_names"]),
-            link_names=tuple(document["link_names"]),
-            name=document["name"],
+            joint_names=names[0],
+            link_names=names[1],
+            name=str(document["name"]),
             **{name: jnp.asarray(document[name]) for name in _OPTIONAL if document.get(name) is not None},  # pyright: ignore[reportArgumentType]
         )
 

@@ -26,10 +26,12 @@ from .effects import (
     smooth_torque,
 )
 from .errors import InputError
+from .inputs import read_json
 
 SCHEMA = "jaxpanda.corrected/1"
 FILE, XML = "corrected.json", "corrected.xml"
 """Names that `diagnose` gives to the corrected arm and to the MJCF with what MuJoCo holds of it."""
+KIND = files.Kind("diagnose", ("diagnosis.json", FILE, XML, "report.html"))
 
 
 class Corrected(eqx.Module):
@@ -235,7 +237,8 @@ def read(folder: str | Path) -> tuple[Corrected, Float[np.ndarray, " dof"]]:
         InputError: there is none, or not as `diagnose` writes it.
     """
     path = Path(folder) / FILE
-    document = files.read_json(path)
+    files.settle(folder)
+    document = read_json(path)
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise InputError(f"{path}: is no corrected model; a folder that `diagnose` wrote is needed")
     try:

@@ -13,14 +13,16 @@ import numpy as np
 from jaxtyping import Float
 
 from . import report, summaries
-from .errors import require_x64
+from .convention import PLAIN, Convention
+from .errors import InputError, require_x64
 from .export import panda_mjcf
-from .files import output_folder
+from .files import Kind, output_folder
 from .identification import Identification, identify
 from .inspection import inspect
 from .mjcf import from_mjcf, standard_from_com
 from .panda import published
 from .pipeline import arm_of, beyond_mjcf, recordings_of, to_mjcf
+from .reading import Reading
 from .recordings import Recording, save
 from .report import Section, number
 from .retrieval import Retrieval, retrieve
@@ -39,6 +41,7 @@ from .validation import Validation, arm_model, validate
 
 MODEL = "panda.xml"
 REPORT = "report.html"
+_LEAVES = ("validation.json", "identification.json", "retrieval.json", MODEL, REPORT)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +89,8 @@ def demonstrate(
     model: Path | None = None,
     starts: int = 2048,
     seed: int = 0,
+    reading: Reading | None = None,
+    convention: Convention = PLAIN,
 ) -> Demonstration:
     """Record (virtually, unless recordings are given), identify, retrieve, export, validate, report.
 
@@ -95,17 +100,22 @@ def demonstrate(
         model: the user's MJCF; the project's Panda without it.
         starts: random starts of the retrieval.
         seed: of the virtual arm and of the starts.
+        reading: which topic, episode, columns and times of the recordings are meant.
+        convention: sign, unit and order of their columns, and the gravity that the arm stands in.
 
     Raises:
         InputError: as the stages do; nothing is left in `out` then.
     """
     require_x64("demonstrate")
     began = time.perf_counter()
-    arm = arm_of(model)
-    with output_folder(out) as folder:
+    if not recordings and (convention != PLAIN or reading not in (None, Reading())):
+        raise InputError("demo: options that say how to read recordings need --recording")
+    arm = arm_of(model, convention.mounting)
+    made = () if recordings else ("recording.csv", "held_out.csv")
+    with output_folder(out, Kind("demo", (*_LEAVES, *made))) as folder:
         if recordings:
             virtual = None
-            training = recordings_of(recordings, arm)
+            training = recordings_of(recordings, arm, model=model, reading=reading, convention=convention)
             testing = training
         else:
             with progress("recording a virtual arm"):
@@ -128,7 +138,7 @@ def demonstrate(
         with progress("exporting and validating"):
             written = to_mjcf(links, folder / MODEL, model)
             beyond, beside = beyond_mjcf(folder / MODEL)
-            checked = validate(folder / MODEL, testing, friction=beyond)
+            checked = validate(folder / MODEL, testing, friction=beyond, gravity=convention.mounting)
             checked = dataclasses.replace(checked, model=MODEL, notes=(*checked.notes, *beside))
         checked.save(folder)
         held_out = "the held-out recording" if virtual else "the recording itself"

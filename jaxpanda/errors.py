@@ -1,4 +1,4 @@
-"""The one error a user can cause."""
+"""What can go wrong that is no defect of ours, each one clear sentence."""
 
 
 class InputError(ValueError):
@@ -13,6 +13,20 @@ class MissingExtraError(InputError):
 
     def __init__(self, what: str, extra: str):
         super().__init__(f"{what} needs the extra [{extra}]: pip install 'jaxpanda[{extra}]'")
+
+
+class OutputError(Exception):
+    """The result cannot be kept though nothing is wrong with what was asked: a full disk, a broken one.
+
+    The commands print it on standard error and end with exit status 1.
+    """
+
+
+def printable(text: str) -> str:
+    """The text with what steers a terminal, breaks a line or is no character written out, as `\\x1b`."""
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
+    )
 
 
 def require_x64(stage: str) -> None:

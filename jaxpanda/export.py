@@ -30,8 +30,9 @@ from jaxtyping import Array, Float
 from . import markup
 from .arm import Arm
 from .errors import InputError
-from .files import read_json, to_json, write_text
+from .files import Kind, output_folder, write_json, write_text
 from .friction import Friction
+from .inputs import read_json
 from .lint import ignored_by_mjx
 from .markup import numbers
 from .mjcf import (
@@ -88,30 +89,24 @@ class ExportResult:
         """Write the file, what it includes, and `<name>.jaxpanda.json` beside it; more warnings come back.
 
         Raises:
-            InputError: an included file of that name stands there with another content.
+            InputError: a file of such a name stands there and is not of an earlier export; nothing is written.
         """
-        path = Path(path)
-        write_document(self.document, path)
-        write_text(path.with_name(f"{path.stem}.jaxpanda.json"), to_json(self.sidecar))
+        path, beside = Path(path), sidecar_of(Path(path))
+        with output_folder(path.parent, Kind("export", (beside.name, path.name))) as folder:
+            write_document(self.document, folder / path.name)
+            write_json(folder / beside.name, self.sidecar)
         return missing_assets(self.document, path.parent)
 
 
-def write_document(document: markup.Document, path: Path) -> None:
-    """Write a file and what it includes.
+def sidecar_of(model: Path) -> Path:
+    """Where an export puts what its MJCF cannot hold."""
+    return model.with_name(f"{model.stem}.jaxpanda.json")
 
-    Raises:
-        InputError: an included file of that name stands there with another content; nothing is written.
-    """
-    included = {path.parent / name: text for name, text in document.texts.items() if name}
-    for file, text in included.items():
-        if file.exists() and file.read_bytes() != text.encode():
-            raise InputError(
-                f"{file}: is included and would be overwritten; write {path.name} into another folder"
-            )
-    for file, text in included.items():
-        if not file.exists():
-            write_text(file, text)
-    write_text(path, document.text)
+
+def write_document(document: markup.Document, path: Path) -> None:
+    """Write a file and what it includes; what it includes from elsewhere comes beside it."""
+    for name, text in markup.gathered(document).texts.items():
+        write_text(path.parent / name if name else path, text)
 
 
 def edit_mjcf(
@@ -506,9 +501,12 @@ def missing_assets(document: markup.Document, folder: Path) -> tuple[str, ...]:
         if e.tag in place and "file" in e.attributes
     ]
     missing = [f for f in files if not (folder / f).exists() and (document.path.parent / f).exists()]
+    named = zip(document.inclusions, markup.gathered(document).inclusions, strict=True)
+    moved = [f"{old!r}, which it includes, is put beside it as {new!r}" for old, new in named if old != new]
     if not missing:
-        return ()
+        return tuple(moved)
     return (
+        *moved,
         f"{len(missing)} meshes, textures or attached models ({missing[0]}, ...) lie beside {document.path}"
         " and not beside the file written: write it there, or copy them",
     )

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from .arm import Arm, unit_of
 from .errors import require_x64
 from .meaning import Meaning, meaning
-from .recordings import Recording
+from .recordings import Origin, Recording
 from .recordings.checks import velocity_scale
 from .signals import LONGEST_GAP, Signals, prepare, repeatability, white_noise, zero_phase
 
@@ -108,10 +108,14 @@ class Inspection:
     repairs: dict[str, int]
     notes: tuple[str, ...]
     verdicts: tuple[str, ...]
+    origin: Origin | None = None
+    """What the file called the channels, and what its source says they are."""
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, lists and strings."""
-        return {"schema": "jaxpanda.inspection/1", **dataclasses.asdict(self)}
+        origin = None if self.origin is None else self.origin.to_json()
+        plain = dataclasses.asdict(dataclasses.replace(self, origin=None))
+        return {"schema": "jaxpanda.inspection/1", **plain, "origin": origin}
 
     def unit(self, turning: str) -> str:
         """`unit_of` the joints."""
@@ -155,6 +159,7 @@ class Inspection:
         facts = [
             f"{self.samples} samples over {self.duration:.3f} s; channels {', '.join(self.channels)}; "
             f"{self.dof} joints",
+            *(self.origin.lines() if self.origin else ()),
             f"rate {self.rate:.4g} Hz; steps {least:.3g} … {median:.3g} … {greatest:.3g} ms; {self.missing} "
             f"samples missing; {self.repeated_rows} repeated rows",
         ]
@@ -218,12 +223,15 @@ def inspect(recording: Recording, arm: Arm | None = None) -> Inspection:
         repairs=dict(signals.repairs),
         notes=signals.notes,
         verdicts=(),
+        origin=recording.origin,
     )
     read = None if arm is None else meaning(recording, arm)
     verdicts = (
         _time_verdicts(inspection) + _unit_verdicts(inspection, arm) + _torque_verdicts(inspection, arm, read)
     )
-    return dataclasses.replace(inspection, verdicts=tuple(verdicts + _motion_verdicts(inspection)))
+    return dataclasses.replace(
+        inspection, verdicts=tuple(verdicts + _declared_verdicts(inspection) + _motion_verdicts(inspection))
+    )
 
 
 def _joint(
@@ -462,6 +470,22 @@ def _torque_verdicts(found: Inspection, arm: Arm | None, read: Meaning | None) -
         elif weight > 0:
             said.append(f"gravity is in the torque: {weight:.2f} times the model's")
     return said
+
+
+def _declared_verdicts(found: Inspection) -> list[str]:
+    """What the source says of gravity in its torque, against what the motion shows."""
+    weights = [joint.gravity_scale for joint in found.joints if joint.gravity_scale is not None]
+    if found.origin is None or not weights:
+        return []
+    says = {"measured": True, "motor_side": True, "gravity_removed": False}.get(found.origin.torque)
+    weight = float(np.median(weights))
+    shows = False if abs(weight) < 0.3 else True if weight > 0.6 else None
+    if says is None or shows is None or says == shows:
+        return []
+    return [
+        f"{found.origin.source} says that its torque {'has' if says else 'is without'} gravity, and the data "
+        f"show {weight:.2f} times the model's: trust the data, and look for what changed it"
+    ]
 
 
 def _motion_verdicts(found: Inspection) -> list[str]:

@@ -5,6 +5,7 @@ elements know the bytes of their start tag, and an edit replaces some of them.
 """
 
 import dataclasses
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -14,7 +15,23 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
+from . import inputs
 from .errors import InputError
+
+BYTES = 1 << 26
+"""Most that a file of a model may have."""
+ELEMENTS, ATTRIBUTES, DEPTH, INCLUDES = 100_000, 500, 200, 50
+"""Most elements of a model (repeated ones each time), attributes of one, levels of elements and of includes."""
+_COUNTS = {
+    "composite": ("count",),
+    "flexcomp": ("count",),
+    "hfield": ("nrow", "ncol"),
+    "texture": ("width", "height"),
+    "user": ("dim",),
+    "size": ("nuserdata", "njmax", "nconmax", "nstack", "nkey"),
+}
+"""Attributes that make MuJoCo allocate their product, by element."""
+_MOST = 1 << 24
 
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
 _TAG = re.compile(rb"""<[^\s/>]+(?:"[^"]*"|'[^']*'|[^"'>])*>""")
@@ -65,6 +82,8 @@ class Document:
     texts: Mapping[str, str]
     """Text by the name the file is included by; the main file under ''."""
     root: Element
+    inclusions: Mapping[str, Element] = dataclasses.field(default_factory=dict)
+    """The `include` element of each of the other texts."""
 
     @property
     def text(self) -> str:
@@ -82,11 +101,7 @@ def read(path: str | Path, root: str) -> Document:
         InputError: a file cannot be read, is no well-formed XML, or the first element is no `root`.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    return parse(_decode(data, path), root, path)
+    return parse(_decode(inputs.read_bytes(path, BYTES), path), root, path)
 
 
 def parse(text: str, root: str, path: Path, known: Mapping[str, str] | None = None) -> Document:
@@ -94,13 +109,45 @@ def parse(text: str, root: str, path: Path, known: Mapping[str, str] | None = No
     tree = _tree(text, path)
     if tree.tag != root:
         raise InputError(f"{path}: line {tree.line}: starts with <{tree.tag}>, where <{root}> is expected")
-    texts = {"": text}
-    _include(tree, path, known or {}, texts)
-    return Document(path, texts, tree)
+    texts, inclusions = {"": text}, {}
+    _include(tree, path, known or {}, texts, inclusions)
+    _require_size(tree)
+    return Document(path, texts, tree, inclusions)
 
 
-def edit(document: Document, edits: Iterable[Edit]) -> Document:
-    """The document with these edits, every other byte as it was."""
+def _require_size(tree: Element) -> None:
+    """Refuse what would have MuJoCo make millions of parts of a few lines."""
+    total, layer = 0, [(tree, 1.0)]
+    while layer:
+        total += sum(times for _, times in layer)
+        for element, times in layer:
+            numbers = [_whole(element.attributes.get(name, "")) for name in _COUNTS.get(element.tag, ())]
+            if max([times, float(np.prod([max(one, 1) for one in numbers]))]) > _MOST or total > ELEMENTS:
+                raise InputError(
+                    f"{element.file}: line {element.line}: <{element.tag}> makes the model larger than {ELEMENTS}"
+                    f" elements or {_MOST} numbers, which no arm is"
+                )
+        layer = [
+            (
+                child,
+                times
+                * max(1.0, _whole(parent.attributes.get("count", "")) if parent.tag == "replicate" else 1.0),
+            )
+            for parent, times in layer
+            for child in parent.children
+        ]
+
+
+def _whole(words: str) -> float:
+    """The product of the numbers in an attribute; 0 where there are none, which MuJoCo will tell."""
+    try:
+        return float(np.prod([float(word) for word in words.split()])) if words.strip() else 0.0
+    except ValueError:
+        return 0.0
+
+
+def edit(document: Document, edits: Iterable[Edit], names: Mapping[str, str] | None = None) -> Document:
+    """The document with these edits, every other byte as it was; `names` gives included texts others."""
     texts = dict(document.texts)
     data = {name: text.encode() for name, text in texts.items()}
     replacements: dict[str, list[tuple[int, int, bytes]]] = {}
@@ -111,7 +158,21 @@ def edit(document: Document, edits: Iterable[Edit]) -> Document:
         for start, stop, new in sorted(parts, reverse=True):
             data[name] = data[name][:start] + new + data[name][stop:]
         texts[name] = data[name].decode()
-    return parse(texts[""], document.root.tag, document.path, {k: v for k, v in texts.items() if k})
+    known = {(names or {}).get(name, name): text for name, text in texts.items() if name}
+    return parse(texts[""], document.root.tag, document.path, known)
+
+
+def gathered(document: Document) -> Document:
+    """The document with what it includes from outside of its folder called by a name inside of it."""
+    names: dict[str, str] = {}
+    for name in document.inclusions:
+        if (inside := os.path.normpath(name)).startswith("..") or os.path.isabs(inside):
+            inside = Path(name).name
+            while inside in {*document.texts, *names.values(), document.path.name}:
+                inside = f"included_{inside}"
+            names[name] = inside
+    edits = [Edit(document.inclusions[old], {"file": new}) for old, new in names.items()]
+    return edit(document, edits, names) if names else document
 
 
 def quote(value: str) -> str:
@@ -152,12 +213,23 @@ def _tree(text: str, path: Path, source: str = "") -> Element:
         match = _TAG.match(data, at)
         if match is None:
             raise InputError(f"{path}: line {parser.CurrentLineNumber}: <{tag}> comes from an entity")
+        if len(attributes) > ATTRIBUTES or len(open_elements) >= DEPTH:
+            what = f"{ATTRIBUTES} attributes" if len(attributes) > ATTRIBUTES else f"{DEPTH} levels"
+            raise InputError(
+                f"{path}: line {parser.CurrentLineNumber}: <{tag}> is beyond {what}, which no model needs"
+            )
         parent = open_elements[-1] if open_elements else None
         element = Element(source, path, parser.CurrentLineNumber, tag, attributes, at, match.end(), parent)
         (parent.children if parent else roots).append(element)
         open_elements.append(element)
 
+    def refuse_entity(name: str, *_: Any) -> None:
+        raise InputError(
+            f"{path}: line {parser.CurrentLineNumber}: declares the entity {name!r}, which MJCF has none of"
+        )
+
     parser.StartElementHandler = start
+    parser.EntityDeclHandler = refuse_entity
     parser.EndElementHandler = lambda tag: open_elements.pop()
     try:
         parser.Parse(data, True)
@@ -175,12 +247,19 @@ def _resolve(path: Path, name: str, includer: Path) -> Path:
     return beside if beside.exists() else includer.parent / name
 
 
-def _include(tree: Element, path: Path, known: Mapping[str, str], texts: dict[str, str]) -> None:
+def _include(
+    tree: Element,
+    path: Path,
+    known: Mapping[str, str],
+    texts: dict[str, str],
+    inclusions: dict[str, Element],
+    depth: int = 0,
+) -> None:
     """Put the children of every included file where its `include` stands."""
     children = []
     for child in tree.children:
         if child.tag != "include":
-            _include(child, path, known, texts)
+            _include(child, path, known, texts, inclusions, depth)
             children.append(child)
             continue
         name = child.attributes.get("file", "")
@@ -191,14 +270,12 @@ def _include(tree: Element, path: Path, known: Mapping[str, str], texts: dict[st
         if name in known:
             texts[name] = known[name]
         else:
-            try:
-                texts[name] = _decode(file.read_bytes(), file)
-            except OSError as error:
-                raise InputError(
-                    f"{where}: includes {name!r}, which cannot be read ({error.strerror})"
-                ) from None
+            texts[name] = _decode(inputs.read_bytes(file, BYTES, f"{where}: includes {name!r}, which"), file)
         included = _tree(texts[name], file, name)
-        _include(included, path, known, texts)
+        inclusions[name] = child
+        if depth >= INCLUDES:
+            raise InputError(f"{where}: includes {name!r} at a depth of more than {INCLUDES} files")
+        _include(included, path, known, texts, inclusions, depth + 1)
         for element in included.children:
             element.parent = tree
             children.append(element)

@@ -23,7 +23,7 @@ import numpy as np
 from jaxpanda_kernels import Chain
 from jaxtyping import Float
 
-from . import markup
+from . import inputs, markup
 from .arm import KNOWN, Arm
 from .errors import InputError
 
@@ -190,6 +190,23 @@ def load_spec(path: str | Path) -> mujoco.MjSpec:
     return _parse(markup.read(path, "mujoco"))
 
 
+def with_shapes(document: markup.Document) -> mujoco.MjSpec:
+    """A text as MuJoCo's parser has it, before compilation, with its meshes and height fields but no pictures.
+
+    Raises:
+        InputError: no MJCF, or a mesh that is no regular file.
+    """
+    spec = _parse(document)
+    for skin in list(spec.skins):
+        spec.delete(skin)
+    _drop_pictures(spec)
+    for asset in [*spec.meshes, *spec.hfields]:
+        file = document.path.parent / spec.meshdir / asset.file
+        if asset.file and file.exists():
+            inputs.require_regular(file)
+    return spec
+
+
 def _parse(document: markup.Document) -> mujoco.MjSpec:
     files = document.includes | _attached(document)
     try:
@@ -205,7 +222,11 @@ def _attached(document: markup.Document) -> dict[str, bytes]:
     """Other models that the file attaches parts of."""
     names = [e.attributes.get("file", "") for e in document.root.walk() if e.tag == "model"]
     files = {name: document.path.parent / name for name in names if name}
-    return {name: file.read_bytes() for name, file in files.items() if file.is_file()}
+    return {
+        name: inputs.read_bytes(file, markup.BYTES, f"{document.path}: attaches {name!r}, which")
+        for name, file in files.items()
+        if file.exists()
+    }
 
 
 def _compile(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
@@ -247,13 +268,17 @@ def _drop_looks(
     meshes = [mesh for mesh in spec.meshes if (mesh.name or Path(mesh.file).stem) not in kept]
     for unused in [*meshes, *spec.hfields, *spec.skins]:
         spec.delete(unused)
+    _drop_pictures(spec)
+    return dropped
+
+
+def _drop_pictures(spec: mujoco.MjSpec) -> None:
     for texture in spec.textures:
         if texture.builtin == mujoco.mjtBuiltin.mjBUILTIN_NONE:
             texture.file, texture.builtin = "", mujoco.mjtBuiltin.mjBUILTIN_FLAT
             texture.width = texture.height = 2
             for i in range(len(texture.cubefiles)):
                 texture.cubefiles[i] = ""
-    return dropped
 
 
 def _gives_inertia(spec: mujoco.MjSpec, geom) -> bool:
@@ -283,6 +308,7 @@ def _check_mesh(spec: mujoco.MjSpec, geom, document: markup.Document) -> None:
             f"{document.path}: body {geom.parent.name!r} takes its inertia from mesh {geom.meshname!r},"
             f" and {file} is missing; put the mesh there or give the body an <inertial>"
         )
+    inputs.require_regular(file)
 
 
 def _serial_joints(model: mujoco.MjModel, path: Path) -> tuple[list[int], list[int]]:

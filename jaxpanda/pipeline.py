@@ -9,21 +9,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import markup
+from . import inputs, markup
 from .arm import Arm
 from .convention import PLAIN, Convention
 from .errors import InputError
-from .export import Change, panda_mjcf, read_sidecar, write_parameters
-from .files import output_folder, write_text
+from .export import Change, panda_mjcf, read_sidecar, sidecar_of, write_parameters
+from .files import output_file, output_folder, remove, write_bytes, write_text
 from .friction import Friction
 from .identification import Identification, identify, identify_mass_gravity
+from .identification.result import KIND as IDENTIFICATION
 from .inspection import Inspection, inspect
 from .lint import lint
 from .mjcf import from_document, from_mjcf
-from .recordings import Recording, distinct, load_many
+from .reading import Reading
+from .recordings import Recording, content_of, distinct, load, load_many
 from .retrieval import CHECKPOINT_FILE, Retrieval, retrieve
+from .retrieval import KIND as RETRIEVAL
 from .session import progress, telling
-from .urdf import left_out, to_urdf
+from .urdf import MARK, left_out, to_urdf
+from .validation import KIND as VALIDATION
 from .validation import Validation, validate
 
 
@@ -38,13 +42,15 @@ def arm_of(model: Path | None, gravity: Sequence[float] | None = None) -> Arm:
 def recordings_of(
     paths: Sequence[Path],
     arm: Arm | None = None,
+    *,
     model: Path | None = None,
+    reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> list[Recording]:
     """Read recordings by the convention of their columns, and make sure that they are of this arm."""
     if not paths:
         raise InputError("--recording: none given; name at least one file or folder")
-    recordings = distinct(convention.applied(load_many(paths), model))
+    recordings = distinct(convention.applied(load_many(paths, reading), model))
     for recording in recordings:
         if arm is not None:
             recording.require_dof(arm.dof)
@@ -61,13 +67,54 @@ class Inspections:
         return {"schema": "jaxpanda.inspections/1", "recordings": [one.to_json() for one in self.recordings]}
 
 
-def inspect_files(paths: Sequence[Path], model: Path | None, convention: Convention = PLAIN) -> Inspections:
+def inspect_files(
+    paths: Sequence[Path],
+    model: Path | None,
+    reading: Reading | None = None,
+    convention: Convention = PLAIN,
+) -> Inspections:
     """`jaxpanda inspect`."""
-    recordings = recordings_of(paths, None, model, convention)
+    recordings = recordings_of(paths, model=model, reading=reading, convention=convention)
     if model is None and any(recording.dof != Arm.panda().dof for recording in recordings):
         return Inspections(tuple(inspect(recording) for recording in recordings))
     arm = arm_of(model, convention.mounting)
     return Inspections(tuple(inspect(recording, arm) for recording in recordings))
+
+
+@dataclasses.dataclass(frozen=True)
+class Conversion:
+    """What was read of a log and written."""
+
+    recording: Recording
+    path: Path
+
+    def to_json(self) -> dict[str, Any]:
+        origin = self.recording.origin
+        return {
+            "schema": "jaxpanda.conversion/1",
+            "path": str(self.path),
+            "samples": self.recording.samples,
+            "joints": self.recording.dof,
+            "origin": None if origin is None else origin.to_json(),
+            "repairs": dict(self.recording.repairs),
+            "notes": list(self.recording.notes),
+        }
+
+
+def convert_file(file: Path, out: Path, reading: Reading, convention: Convention = PLAIN) -> Conversion:
+    """`jaxpanda convert`: the recording of a log, as a file that reads back to the same numbers."""
+    log, end = file.resolve(), out.resolve()
+    if end == log or log in end.parents or (out.exists() and file.exists() and out.samefile(file)):
+        raise InputError(f"--out {out}: is the log itself or lies in it; choose another place")
+    if convention.gravity:
+        raise InputError(
+            "--gravity: is a matter of the model; give it to the command that reads what convert writes"
+        )
+    (recording,) = convention.applied([load(file, reading=reading)])
+    content = content_of(recording, out)
+    with output_file(out, content.__eq__) as written:  # of what stands there nothing tells whose it is
+        write_bytes(written, content)
+    return Conversion(recording, out)
 
 
 def identify_files(
@@ -81,19 +128,20 @@ def identify_files(
     weighting: str,
     cutoff: float,
     folds: int,
+    reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> Identification:
     """`jaxpanda identify`."""
     if (mass_gravity is None) == (not recordings):
         raise InputError("identify: give either --recording or --mass-gravity, one of the two")
     arm = arm_of(model, convention.mounting)
-    with output_folder(out) as folder:
+    with output_folder(out, IDENTIFICATION) as folder:
         if mass_gravity is not None:
             found = identify_mass_gravity(mass_gravity, arm, folds=folds)
         else:
             with progress("identifying") as tick:
                 found = identify(
-                    recordings_of(recordings, arm, model, convention),
+                    recordings_of(recordings, arm, model=model, reading=reading, convention=convention),
                     arm,
                     method=method,
                     friction=friction,
@@ -140,21 +188,21 @@ def retrieve_files(
         done = finished
         tick(finished, total)
 
-    with output_folder(out) as folder, progress("random starts") as tick:
+    with output_folder(out, RETRIEVAL) as folder, progress("random starts") as tick:
         try:
             links = retrieve(identification, **options, checkpoint=checkpoint, progress=count)
             links.save(folder)
         except KeyboardInterrupt:
             if not done:
-                checkpoint.unlink(missing_ok=True)
+                remove(checkpoint)
                 raise
             said = f"{done} of {starts} starts are kept in {checkpoint}; the same command goes on from there"
             raise KeyboardInterrupt(said) from None
         except InputError:
             if done == starts:  # of these starts nothing can be made
-                checkpoint.unlink(missing_ok=True)
+                remove(checkpoint)
             raise
-    checkpoint.unlink(missing_ok=True)
+    remove(checkpoint)
     return links
 
 
@@ -192,14 +240,21 @@ def to_mjcf(links: Retrieval, out: str | Path, model: str | Path | None = None) 
         InputError: the model holds another arm, cannot hold the parameters, or is not there any more.
     """
     out = Path(out)
-    model = model or _identified_file(links)
+    if out.suffix.lower() not in (".xml", ".urdf"):
+        raise InputError(f"{out}: a name ending in .xml (MJCF) or .urdf is needed")
+    with inputs.remembered():
+        return _to_mjcf(links, out, model or _identified_file(links))
+
+
+def _to_mjcf(links: Retrieval, out: Path, model: str | Path | None) -> Export:
     own = model is None
     arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", out)) if own else from_mjcf(model)
     if links.dof != arm.dof:
         raise InputError(f"{model or 'the Panda'}: has {arm.dof} links, but the retrieval has {links.dof}")
     arm = dataclasses.replace(arm, **{name: jnp.asarray(values) for name, values in links.known.items()})
-    if out.suffix == ".urdf":
-        write_text(out, to_urdf(arm, links.standard, links.friction))
+    if out.suffix.lower() == ".urdf":
+        with output_file(out, lambda content: MARK.encode() in content) as file:
+            write_text(file, to_urdf(arm, links.standard, links.friction))
         return Export(out, (), tuple(f"not in {out.name}: {what}" for what in left_out(arm, links.friction)))
     written = write_parameters(source, arm, links.standard, links.friction)
     return Export(out, () if own else written.changes, (*written.warnings, *written.save(out)))
@@ -225,16 +280,17 @@ def validate_files(
     *,
     cutoff: float,
     in_mjx: bool = True,
+    reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> Validation:
     """`jaxpanda validate`: with the offset in an exported file's sidecar, and what the lint has to say."""
     engines = "MuJoCo and MJX; MJX takes most of the time, --no-mjx leaves it out" if in_mjx else "MuJoCo"
-    with output_folder(out) as folder, telling("validating") as say:
+    with output_folder(out, VALIDATION) as folder, telling("validating") as say:
         say(f"comparing inverse dynamics, torque and a roll-out in {engines}")
         friction, beside = beyond_mjcf(model)
-        read = recordings_of(recordings, None, model, convention)
+        logs = recordings_of(recordings, model=model, reading=reading, convention=convention)
         checked = validate(
-            model, read, cutoff=cutoff, in_mjx=in_mjx, friction=friction, gravity=convention.mounting
+            model, logs, cutoff=cutoff, in_mjx=in_mjx, friction=friction, gravity=convention.mounting
         )
         slips = tuple(f"{slip.severity}: {slip.where}: {slip.message}" for slip in lint(model))
         checked = dataclasses.replace(checked, notes=(*checked.notes, *beside, *slips))
@@ -244,7 +300,7 @@ def validate_files(
 
 def beyond_mjcf(model: Path) -> tuple[Friction | None, tuple[str, ...]]:
     """The constant torque in `<name>.jaxpanda.json` beside a model that was exported here, and a note of it."""
-    file = model.with_name(f"{model.stem}.jaxpanda.json")
+    file = sidecar_of(model)
     if not file.exists():
         return None, ()
     offset = np.array(read_sidecar(file)["torque_offset"])

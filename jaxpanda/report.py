@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from .errors import printable
 from .files import write_text
 
 _PIPED_WIDTH = 200
@@ -98,6 +99,7 @@ def to_terminal(sections: Sequence[Section], width: int | None = None) -> None:
     wrapped = width is not None or sys.stdout.isatty() or "COLUMNS" in os.environ
     console = Console(highlight=False, width=width if wrapped else _PIPED_WIDTH)
     for section in sections:
+        section = _printable(section)
         console.print(f"\n[bold]{escape(section.heading)}[/bold]")
         for sentence in section.sentences:
             console.print(escape(sentence), soft_wrap=not wrapped)
@@ -137,6 +139,23 @@ def _fitting(table: Table, width: int) -> list[Table]:
     ]
 
 
+def _printable(section: Section) -> Section:
+    """The section with nothing in its text that steers a terminal: names of files may have anything."""
+    tables = [
+        dataclasses.replace(
+            table,
+            columns=[printable(column) for column in table.columns],
+            rows=[[printable(cell) for cell in row] for row in table.rows],
+            caption=printable(table.caption),
+        )
+        for table in section.tables
+    ]
+    sentences = ["\n".join(map(printable, sentence.split("\n"))) for sentence in section.sentences]
+    return dataclasses.replace(
+        section, heading=printable(section.heading), sentences=sentences, tables=tables
+    )
+
+
 def to_html(title: str, sections: Sequence[Section], path: str | Path) -> None:
     """Write sections as one self-contained page."""
     import jinja2
@@ -155,6 +174,7 @@ def _svg(figure: Figure) -> str:
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure as Canvas
+    from matplotlib.text import Text
 
     style: Any = {
         "svg.fonttype": "none",
@@ -162,11 +182,14 @@ def _svg(figure: Figure) -> str:
         "axes.grid": True,
         "grid.alpha": 0.3,
         "lines.linewidth": 0.9,
+        "text.parse_math": False,  # a file's name may have dollar signs
     }
     with matplotlib.rc_context(style):
         canvas = Canvas(figsize=figure.size, layout=figure.layout)  # pyright: ignore[reportArgumentType]
         FigureCanvasSVG(canvas)
         figure.draw(canvas)
+        for text in canvas.findobj(Text):
+            text.set_text("\n".join(map(printable, text.get_text().split("\n"))))  # pyright: ignore
         buffer = io.StringIO()
         canvas.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = buffer.getvalue()

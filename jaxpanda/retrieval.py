@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -24,17 +23,19 @@ from .feasible.constraints import less_lumped
 from .feasible.nearest import are_buildable
 from .feasible.schedule import Device
 from .feasible.solver import NOTHING, STARTS
-from .files import finite, output_folder, read_json, to_json
+from .files import Kind, finite, output_folder, settle, write_json, write_npz
 from .friction import Friction
 from .identification import Identification
 from .identification.condensed import Evidence, least_friction, own_parameters, with_own_parameters
 from .identification.result import known_physics
+from .inputs import read_json, read_npz
 from .panda import panda
 from .parameters import coefficient_matrix
 
 SCHEMA = "jaxpanda.retrieval/1"
 FILE = "retrieval.json"
 STARTS_FILE = "starts.npz"
+KIND = Kind("retrieve", (FILE, STARTS_FILE))
 CHECKPOINT_FILE = "starts.partial"
 AS_GOOD = 1.01
 """A solution is as good as the best where its objective is within this factor of it."""
@@ -145,11 +146,11 @@ class Retrieval:
 
     def save(self, folder: str | Path) -> Path:
         """Write `retrieval.json`, and every start's outcome as `starts.npz`; both or neither."""
-        with output_folder(folder) as scratch:
-            (scratch / FILE).write_text(to_json(self.to_json()), "utf-8")
+        with output_folder(folder, KIND) as scratch:
+            write_json(scratch / FILE, self.to_json())
             if self.solutions is not None:  # as it is: random numbers do not compress
                 names = [field.name for field in dataclasses.fields(self.solutions)]
-                np.savez(scratch / STARTS_FILE, **{name: getattr(self.solutions, name) for name in names})
+                write_npz(scratch / STARTS_FILE, {name: getattr(self.solutions, name) for name in names})
         return Path(folder) / FILE
 
     @classmethod
@@ -161,6 +162,7 @@ class Retrieval:
         """
         path = Path(path)
         file = path / FILE if path.is_dir() else path
+        settle(file.parent)
         document = read_json(file)
         if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
             raise InputError(f"{file}: is no retrieval (schema '{SCHEMA}'); `retrieve` writes one")
@@ -193,7 +195,9 @@ class Retrieval:
                 notes=tuple(document["notes"]),
                 solutions=_load_starts(file.with_name(STARTS_FILE)),
             )
-        except (KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        except InputError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"{file}: field missing or malformed ({error}); `retrieve` writes it whole"
             ) from None
@@ -598,8 +602,7 @@ def _notes(table: Identification, found: Solutions, weighting: str) -> list[str]
 def _load_starts(path: Path) -> Solutions | None:
     if not path.is_file():
         return None
-    with np.load(path) as arrays:
-        fields: dict[str, Any] = {name: arrays[name] for name in arrays.files}
+    fields: dict[str, Any] = dict(read_npz(path))
     for name in ("compile_seconds", "run_seconds"):
         fields[name] = float(fields[name])
     return Solutions(**fields)

@@ -18,7 +18,7 @@ import scipy.signal
 from jaxtyping import Bool, Float, Int
 
 from .errors import InputError
-from .recordings import Recording
+from .recordings import Recording, plausible
 from .recordings.ticks import PERIODS
 
 DERIVATIVE_CUTOFF = 25.0
@@ -110,8 +110,9 @@ def prepare(
             makes up beyond the ends is then below 1e-4 N m at 5 Hz (0.02 N m at 1 Hz).
 
     Raises:
-        InputError: a cutoff that the rate does not allow, or too short a recording.
+        InputError: a cutoff that the rate does not allow, too short a recording, or one in other units.
     """
+    plausible(recording)
     time, step, repairs, notes = _grid(recording)
     full_rate = 1 / step
     derivative_cutoff, notes = _cutoffs(recording.name, cutoff, derivative_cutoff, full_rate, notes)

@@ -28,6 +28,15 @@ def inspection(one: Any) -> Section:
     return Section(f"Recording {one.name}", one.lines(), [Table(columns, quantities)])
 
 
+def conversion(made: Any) -> Sequence[Section]:
+    """What was read of a log, and where it was written."""
+    log = made.recording
+    lines = [f"{log.samples} samples of {log.dof} joints, written to {made.path}"]
+    lines += log.origin.lines() if log.origin else []
+    lines += [f"{what}: {count}" for what, count in log.repairs.items()]
+    return [Section(f"Recording {log.name}", [*lines, *log.notes])]
+
+
 def identification(found: Any) -> Sequence[Section]:
     """Coefficients with their deviations, friction, and what is left unexplained."""
     names = found.joint_names or [f"joint {i + 1}" for i in range(found.dof)]
@@ -359,6 +368,54 @@ def payload(found: Any) -> Sequence[Section]:
     return sections
 
 
+def excitation(found: Any) -> Sequence[Section]:
+    """What the motion tells, what it takes of the limits, and the files."""
+    document = found.to_json()
+    conditions, check, names = document["condition_number"], document["check"], document["joints"]
+    sentences = [
+        f"A periodic motion of {found.seconds:g} s from rest to rest; condition number of the regressor "
+        f"{number(conditions['base'], 3)}, with friction columns {number(conditions['with_friction'], 3)} "
+        f"(weighted by torque noise {number(conditions['base_weighted'], 3)} and "
+        f"{number(conditions['with_friction_weighted'], 3)}).",
+    ]
+    if (closest := check["closest"])["distance"] is not None:
+        sentences.append(
+            f"MuJoCo's smallest distance along it is {closest['distance']:.3f} m, between {closest['pair']} at "
+            f"{closest['time']:.2f} s."
+        )
+    sentences += [f"Limit of {name}: {text}." for name, text in document["limits"]["sources"].items()]
+    limits = document["limits"]
+    taken = {
+        "lowest": check["low"],
+        "highest": check["high"],
+        **{
+            f"{name} %": [
+                None if most is None else 100 * value / most
+                for value, most in zip(check[name], limits[name], strict=True)
+            ]
+            for name in ("velocity", "acceleration", "jerk", "torque")
+        },
+    }
+    rows = [
+        [row["expression"], f"{row['nominal']:.4g}", number(row.get("std_before"), 2), number(row["std"], 2)]
+        for row in document["parameters"]
+    ]
+    friction = {
+        f"{name}": [row["std"][name] for row in document["friction"]] for name in found.precision.friction
+    }
+    tables = [
+        by_joint("Positions reached, and shares of the limits that the motion takes", names, taken),
+        Table(
+            ["coefficient", "nominal", "std before", "std"],
+            rows,
+            "Standard deviation that a recording would give [kg m², kg m]",
+        ),
+        by_joint("The same of friction [N m s/rad, N m, N m]", names, friction),
+    ]
+    sentences.append(f"Files: {', '.join(document['files'])}.")
+    return [Section("Excitation", [*sentences, *document["notes"]], tables)]
+
+
 def _told(name: str, numbers: Any, k: int) -> list[str]:
     """A row: a number and its interval, or the range of what it can be."""
     low, high = numbers.interval[k]
@@ -377,5 +434,7 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Misread": diagnosis,
     "Prediction": prediction,
     "PayloadEstimate": payload,
+    "Conversion": conversion,
+    "Excitation": excitation,
     "Demonstration": lambda result: result.sections,
 }

@@ -8,6 +8,7 @@ from .friction import Friction
 from .markup import numbers, quote
 from .mjcf import com_from_standard
 
+MARK = "written by jaxpanda"
 UNLIMITED = 1e6
 """Written for an effort [N m] or velocity [rad/s] that the arm does not tell: URDF demands a number."""
 
@@ -38,6 +39,7 @@ def to_urdf(
     effort = np.full(arm.dof, UNLIMITED) if effort is None else effort
     velocity = np.full(arm.dof, UNLIMITED) if velocity is None else velocity
     lines = [f'<robot name="{quote(arm.name)}">']
+    lines.append(f"  <!-- {MARK} -->")
     if parts := left_out(arm, friction):
         lines.append(f"  <!-- not in this file: {'; '.join(parts)} -->")
     lines.append(f'  <link name="{_base(arm)}"/>')

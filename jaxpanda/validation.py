@@ -37,6 +37,9 @@ from .mjcf import MjcfSource, from_mjcf, own_log
 from .recordings import Recording
 from .signals import Signals, derivatives, prepare, zero_phase
 
+FILE = "validation.json"
+KIND = files.Kind("validate", (FILE,))
+
 AGREEMENT = 1e-9
 """How far engines may differ, as a share of the largest torque or of 1 N m."""
 STATES = 500
@@ -147,9 +150,9 @@ class Validation:
 
     def save(self, folder: str | Path) -> Path:
         """Write `validation.json` into a folder, whole or not at all."""
-        path = Path(folder) / "validation.json"
-        files.write_json(path, self.to_json())
-        return path
+        with files.output_folder(folder, KIND) as scratch:
+            files.write_json(scratch / FILE, self.to_json())
+        return Path(folder) / FILE
 
 
 def _rollout_json(rollout: Rollout | None) -> dict[str, Any] | None:

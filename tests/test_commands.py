@@ -428,3 +428,64 @@ def test_an_export_s_table_has_six_digits_and_its_json_all():
     (row,) = of(written)[0].tables[0].rows
     assert row[-1] == "0.123457 -1.23457e-05 2"
     assert written.to_json()["changes"][0]["new"] == change.new
+
+
+def test_a_log_is_converted_to_what_reads_back_the_same(capsys, recording, tmp_path):
+    from jaxpanda.recordings import load
+
+    log, mine = load(recording), tmp_path / "mine.csv"
+    head, *rows = recording.read_text().splitlines()
+    names = head.replace("time", "t").replace("dq_", "vel_").replace("tau_", "effort_").replace("q_", "pos_")
+    mine.write_text("\n".join([names, *rows]) + "\n")
+    columns = ("time=t", "q=pos_{j}", "dq=vel_{j}", "tau=effort_{j}")
+    assert f"--columns {' '.join(columns)}" in refused(capsys, "inspect", "--recording", str(mine))
+    out = tmp_path / "rec.csv"
+    assert main(["convert", str(mine), "--columns", *columns, "--out", str(out)]) == 0
+    assert "pos_1 … pos_7" in capsys.readouterr().out
+    back = load(out)
+    for ours, theirs in zip([back.time, *back.channels()], [log.time, *log.channels()], strict=True):
+        assert np.array_equal(ours, theirs)
+    assert main(["inspect", "--recording", str(mine), "--columns", *columns, "--to", "2", "--json"]) == 0
+    (one,) = json.loads(capsys.readouterr().out)["recordings"]
+    assert one["origin"]["channels"]["tau"] == "effort_1 … effort_7"
+    assert one["duration"] == pytest.approx(2.0, abs=0.01)
+
+
+def test_a_conversion_never_replaces_its_log(capsys, recording, tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_bytes(recording.read_bytes())
+    (tmp_path / "link.csv").symlink_to(log)
+    (tmp_path / "hard.csv").hardlink_to(log)
+    for out in ("log.csv", "link.csv", "hard.csv"):
+        assert "is the log itself" in refused(capsys, "convert", str(log), "--out", str(tmp_path / out))
+    assert "or lies in it" in refused(capsys, "convert", str(tmp_path), "--out", str(tmp_path / "new.csv"))
+    assert log.read_bytes() == recording.read_bytes()
+    assert not (tmp_path / "new.csv").exists()
+
+
+@pytest.mark.parametrize("suffix", ["csv", "csv.gz", "npz", "parquet"])
+def test_a_conversion_replaces_nothing_but_what_it_would_write(capsys, recording, tmp_path, suffix):
+    mine, out = tmp_path / f"mine.{suffix}", tmp_path / f"out.{suffix}"
+    mine.write_text("a user's")
+    (tmp_path / f"link.{suffix}").symlink_to(mine)
+    convert = ["convert", str(recording), "--out"]
+    assert "no earlier result" in refused(capsys, *convert, str(mine))
+    assert "is a link" in refused(capsys, *convert, str(tmp_path / f"link.{suffix}"))
+    assert mine.read_text() == "a user's"
+    assert main([*convert, str(out)]) == main([*convert, str(out)]) == 0
+    capsys.readouterr()
+    assert "no earlier result" in refused(capsys, *convert, str(out), "--to", "2")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["convert"], "needs FILE and --out"),
+        (["convert", "a.csv"], "needs --out"),
+        (["inspect", "--recording", "a.csv", "--columns", "t"], "CHANNEL=COLUMNS is needed"),
+        (["inspect", "--recording", "a.csv", "--from", "x"], "--from: 'x' is no number"),
+        (["inspect", "--recording", "a.csv", "--topics", "x"], "did you mean --topic?"),
+    ],
+)
+def test_reading_options_are_refused_like_others(capsys, arguments, message):
+    assert message in refused(capsys, *arguments)

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from jaxpanda import files
+from jaxpanda import files, inputs
 from jaxpanda.demo import demonstrate, record
 from jaxpanda.errors import InputError
 from jaxpanda.report import Figure, Section, Table, to_html, to_terminal
@@ -93,4 +93,4 @@ def test_json_refuses_what_is_not_finite(tmp_path):
         files.to_json({"x": float("nan")})
     (tmp_path / "x.json").write_text('{"x": NaN}')
     with pytest.raises(InputError, match="NaN"):
-        files.read_json(tmp_path / "x.json")
+        inputs.read_json(tmp_path / "x.json")

@@ -245,7 +245,7 @@ def test_an_included_file_takes_the_change_and_is_never_overwritten(tmp_path):
     result = write_parameters(source, arm, phi)
     assert result.text == source.text
     assert {change.file for change in result.changes} == {str(tmp_path / "in" / "parts" / "arm.xml")}
-    with pytest.raises(InputError, match=r"arm\.xml: is included and would be overwritten"):
+    with pytest.raises(InputError, match=r"arm\.xml: stands there already"):
         result.save(tmp_path / "in" / "new.xml")
     assert not (tmp_path / "in" / "new.xml").exists()
     result.save(tmp_path / "out" / "new.xml")

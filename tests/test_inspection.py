@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import equinox as eqx
@@ -10,7 +11,7 @@ from jaxpanda_kernels import gravity_torque
 from jaxpanda.errors import InputError
 from jaxpanda.inspection import Inspection, inspect
 from jaxpanda.panda import panda
-from jaxpanda.recordings import Recording, load
+from jaxpanda.recordings import Origin, Recording, load
 
 CENTRE = np.array([0.0, -0.3, 0.0, -1.8, 0.0, 1.8, 0.0])
 
@@ -98,6 +99,23 @@ def test_gravity_taken_out_by_the_controller_is_noticed():
     gravity = jax.vmap(lambda q: gravity_torque(arm.chain, arm.standard, q))(jnp.asarray(good.q))
     found = inspect(Recording("free", good.time, good.q, good.qd, good.tau - np.asarray(gravity)), arm)
     assert "torque column holds no gravity" in said(found)
+
+
+@pytest.mark.parametrize("declared", ["measured", "gravity_removed", "unstated"])
+@pytest.mark.parametrize("without", [True, False])
+def test_what_a_source_says_of_gravity_is_tested_by_the_motion(declared, without):
+    """UR's `effort` changed from current to torque without gravity within one driver."""
+    recording = virtual()
+    assert recording.tau is not None
+    if without:
+        arm = panda()
+        weight = jax.vmap(lambda q: gravity_torque(arm.chain, arm.standard, q))(jnp.asarray(recording.q))
+        recording = dataclasses.replace(recording, tau=recording.tau - np.asarray(weight))
+    origin = Origin("somebody's driver", {"q": "position"}, declared, "what it says")
+    found = inspect(dataclasses.replace(recording, origin=origin), panda())
+    wrong = declared != "unstated" and without != (declared == "gravity_removed")
+    assert ("somebody's driver says that its torque" in said(found)) == wrong
+    assert "its source says: what it says" in " ".join(found.lines())
 
 
 def test_a_joint_that_rests_is_named_and_shows_less():

@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from jaxpanda.__main__ import main
 from jaxpanda.errors import InputError
+from jaxpanda.files import output_folder, write_json, write_text
 from jaxpanda.mjcf import from_mjcf
 from jaxpanda.payload import estimate_payload
 from jaxpanda.payload.frame import frame_of
-from jaxpanda.payload.result import result_of
+from jaxpanda.payload.result import KIND, result_of
 from jaxpanda.recordings import save
 
 TRUTH = np.r_[pairs.BODY.mass, pairs.BODY.com, pairs.BODY.inertia]
@@ -125,9 +126,11 @@ def test_intervals_of_twenty_pairs_hold_the_truth(tmp_path):
 
 def test_a_pair_without_a_body_shows_none_and_old_files_go(tmp_path):
     out = tmp_path / "out"
-    out.mkdir()
-    for name in ("payload.xml", "with_payload.xml", "mine.txt"):
-        (out / name).write_text("from before")
+    with output_folder(out, KIND) as folder:
+        write_json(folder / "payload.json", {"schema": "jaxpanda.payload/1"})
+        for name in ("payload.xml", "with_payload.xml"):
+            write_text(folder / name, "from before")
+    (out / "mine.txt").write_text("from before")
     user, without, loaded = pairs.panda_pair(3, body=None, seconds=8.0)
     (tmp_path / "user.xml").write_text(user)
     save(without, tmp_path / "without.csv")

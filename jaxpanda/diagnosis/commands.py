@@ -1,7 +1,6 @@
 """The commands `diagnose` and `predict`: between files and files."""
 
 import dataclasses
-import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,12 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .. import report
+from .. import inputs, report
 from ..convention import PLAIN, Convention
-from ..corrected import XML, read
+from ..corrected import KIND, XML, read
 from ..errors import InputError
 from ..export import missing_assets
-from ..files import output_folder, write_text
+from ..files import output_file, output_folder, write_text
+from ..reading import Reading
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
 from ..session import telling
@@ -60,15 +60,19 @@ def diagnose_files(
     recordings: Sequence[Path],
     reference: Sequence[Path],
     knowledge: Knowledge,
+    *,
+    reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> Diagnosis | resting.AtRest | meaning.Misread:
     """`jaxpanda diagnose`."""
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
-    with output_folder(out) as folder, telling("diagnosing") as say:
+    with output_folder(out, KIND) as folder, telling("diagnosing") as say:
         count = len(recordings) + len(reference)
         say(f"reading {count} recording{'s' * (count != 1)}")
-        suspect, healthy = (convention.applied(load_many(ps), model) for ps in (recordings, reference))
+        suspect, healthy = (
+            convention.applied(load_many(paths, reading), model) for paths in (recordings, reference)
+        )
         every = distinct([*suspect, *healthy])
         suspect, healthy = every[: len(suspect)], every[len(suspect) :]
         found = diagnose(
@@ -96,7 +100,7 @@ def diagnose_files(
             say("writing the report")
             sections = page.sections(found)
         report.to_html("jaxpanda: diagnosis", sections, folder / "report.html")
-        found.save(out)  # not by way of the other folder: what is included may belong outside of `out`
+        found.save(folder)
     return found
 
 
@@ -138,21 +142,32 @@ def _replayed(found: Diagnosis, recordings: Sequence[Recording]) -> Diagnosis:
 def _source(role: str, path: Path, names: Mapping[Path | None, str]) -> dict[str, str]:
     """Name and digest of a file, or of all files of a folder in the order of their names."""
     parts = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(part.read_bytes())
     name = path.name if path.is_dir() else names.get(path, path.name)
-    return {"role": role, "name": name, "sha256": digest.hexdigest()}
+    return {"role": role, "name": name, "sha256": inputs.digest(*parts)}
 
 
-def predict_files(diagnosis: Path, recording: Path, out: Path) -> Prediction:
+_OWN = re.compile(rb"time(,tau_\d+)+\n")  # no recording has torque and no position
+
+
+def predict_files(
+    diagnosis: Path,
+    recording: Path,
+    out: Path,
+    reading: Reading | None = None,
+    convention: Convention = PLAIN,
+) -> Prediction:
     """`jaxpanda predict`: torque, and where the motion has torque recorded, how far it is off."""
-    motion = load(recording)
+    if out.suffix.lower() != ".csv":
+        raise InputError(f"{out}: a name ending in .csv is needed")
+    if convention.mounting is not None:
+        raise InputError(f"--gravity: {XML} has its gravity already; give it to the command diagnose")
+    (motion,) = convention.applied([load(recording, reading=reading)], diagnosis / XML)
     arm = read(diagnosis)[0].arm
     tau = predict(diagnosis, motion)
     head = ",".join(["time", *(f"tau_{j + 1}" for j in range(tau.shape[1]))])
     table = np.column_stack([motion.time if motion.stamps is None else motion.stamps, tau]).tolist()
-    write_text(out, "\n".join([head, *(",".join(map(repr, row)) for row in table)]) + "\n")
+    with output_file(out, lambda content: _OWN.match(content) is not None) as file:
+        write_text(file, "\n".join([head, *(",".join(map(repr, row)) for row in table)]) + "\n")
     made = Prediction(out, len(tau), arm.joint_names, arm.unit("N·m"), _rms(tau))
     if motion.tau is None:
         return made

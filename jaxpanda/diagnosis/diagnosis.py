@@ -14,7 +14,7 @@ from jaxtyping import Float
 from .. import files, markup
 from .. import signals as signals_
 from ..arm import Arm
-from ..corrected import FILE, XML, Corrected, read
+from ..corrected import FILE, KIND, XML, Corrected, read
 from ..effects import AbstractEffect
 from ..effects.drive import Armature
 from ..errors import InputError, require_x64
@@ -157,18 +157,16 @@ class Diagnosis:
         one would decide. What corrected.xml will not find there comes back, a sentence each.
 
         Raises:
-            InputError: an included file of that name stands there with another content; nothing is written.
+            InputError: a file of such a name stands there that no earlier diagnosis left; nothing is written.
         """
-        folder, document = Path(folder), self.to_json()
-        write_document(self.written, folder / XML)
-        files.write_json(folder / "diagnosis.json", document)
-        files.write_json(
-            folder / FILE,
-            {**self.corrected.to_json(), "torque_noise": [float(v) for v in self.fit.noise_floor]},
-        )
-        if self.next_motion is not None:
-            self.next_motion.save(folder / NEXT_MOTION)
-        return missing_assets(self.written, folder)
+        noise = [float(v) for v in self.fit.noise_floor]
+        with files.output_folder(folder, KIND) as scratch:
+            write_document(self.written, scratch / XML)
+            files.write_json(scratch / KIND.names[0], self.to_json())
+            files.write_json(scratch / FILE, {**self.corrected.to_json(), "torque_noise": noise})
+            if self.next_motion is not None:
+                self.next_motion.save(scratch / NEXT_MOTION)
+        return missing_assets(self.written, Path(folder))
 
 
 @on_host

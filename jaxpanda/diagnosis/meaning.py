@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import files, markup, summaries
-from ..corrected import FILE, XML, Corrected
+from ..corrected import FILE, KIND, XML, Corrected
 from ..export import missing_assets, write_document
 from ..meaning import Meaning, meaning
 from ..mjcf import MjcfSource
@@ -83,12 +83,12 @@ class Misread:
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
         """Write diagnosis.json, corrected.xml and corrected.json, of the user's model as it is."""
-        folder, document = Path(folder), self.to_json()
-        write_document(self.written, folder / XML)
-        files.write_json(folder / "diagnosis.json", document)
         noise = [float(v) for v in self.fit.noise_floor]
-        files.write_json(folder / FILE, {**self.corrected.to_json(), "torque_noise": noise})
-        return missing_assets(self.written, folder)
+        with files.output_folder(folder, KIND) as scratch:
+            write_document(self.written, scratch / XML)
+            files.write_json(scratch / KIND.names[0], self.to_json())
+            files.write_json(scratch / FILE, {**self.corrected.to_json(), "torque_noise": noise})
+        return missing_assets(self.written, Path(folder))
 
 
 def misread(

@@ -32,7 +32,7 @@ from jaxtyping import Bool, Float
 
 from .. import files, markup, summaries
 from ..arm import Arm
-from ..corrected import FILE, XML, Corrected
+from ..corrected import FILE, KIND, XML, Corrected
 from ..effects import Motion
 from ..export import write_document
 from ..mjcf import MjcfSource
@@ -184,12 +184,12 @@ class AtRest:
         """Write diagnosis.json, corrected.xml and corrected.json."""
         from ..export import missing_assets
 
-        folder, document = Path(folder), self.to_json()
-        write_document(self.written, folder / XML)
-        files.write_json(folder / "diagnosis.json", document)
         noise = [float(v) for v in self.fit.noise_floor]
-        files.write_json(folder / FILE, {**self.corrected.to_json(), "torque_noise": noise})
-        return missing_assets(self.written, folder)
+        with files.output_folder(folder, KIND) as scratch:
+            write_document(self.written, scratch / XML)
+            files.write_json(scratch / KIND.names[0], self.to_json())
+            files.write_json(scratch / FILE, {**self.corrected.to_json(), "torque_noise": noise})
+        return missing_assets(self.written, Path(folder))
 
 
 def rests(trace: Trace) -> bool:

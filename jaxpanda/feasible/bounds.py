@@ -11,6 +11,7 @@ import numpy as np
 from jaxpanda_kernels import inertia
 from jaxtyping import Float
 
+from .. import inputs
 from ..arm import Arm
 from ..errors import InputError
 from ..panda import is_panda
@@ -148,12 +149,7 @@ class Bounds:
 
 def _read_table(path: Path) -> dict[str, tuple[float, float]]:
     """Rows of a `name,lower,upper` table."""
-    try:
-        text = path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: cannot be read as a table of bounds ({error}); a CSV file would work"
-        ) from error
+    text = inputs.read_text(path, 1 << 20, "a CSV table of bounds")
     reader = csv.DictReader(text.splitlines())
     columns = {"name", "lower", "upper"}
     if not columns <= set(reader.fieldnames or ()):

@@ -8,7 +8,6 @@ links explain torque, and how well such links do where they were not fitted.
 """
 
 import dataclasses
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,7 +15,9 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
+from .. import inputs
 from ..errors import InputError
+from ..files import write_npz
 from ..friction import DISSIPATIVE, LINEAR, Friction
 from .regression import Masks, Regression, triangle, triangles, weighted_fit
 
@@ -108,12 +109,12 @@ class Evidence:
     def save(self, path: Path) -> None:
         """Write the arrays; whoever calls sees to it that nothing is left half-written."""
         parts = [self.whole, *(part for fold in self.folds for part in fold)]
-        np.savez(
-            path,
-            R=np.stack([part.R for part in parts]),
-            samples=np.array([part.samples for part in parts]),
-            torque=np.array([part.torque for part in parts]),
-        )
+        arrays = {
+            "R": np.stack([part.R for part in parts]),
+            "samples": np.array([part.samples for part in parts]),
+            "torque": np.array([part.torque for part in parts]),
+        }
+        write_npz(path, arrays)
 
     @classmethod
     def load(cls, path: Path) -> "Evidence":
@@ -123,15 +124,15 @@ class Evidence:
             InputError: the file is not as `identify` writes it.
         """
         try:
-            with np.load(path) as arrays:
-                parts = [
-                    Condensed(np.asarray(R, float), int(samples), float(torque))
-                    for R, samples, torque in zip(
-                        arrays["R"], arrays["samples"], arrays["torque"], strict=True
-                    )
-                ]
+            arrays = inputs.read_npz(path)
+            parts = [
+                Condensed(np.asarray(R, float), int(samples), float(torque))
+                for R, samples, torque in zip(arrays["R"], arrays["samples"], arrays["torque"], strict=True)
+            ]
             return cls(parts[0], tuple(zip(parts[1::2], parts[2::2], strict=True)))
-        except (OSError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
+        except InputError:
+            raise
+        except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(
                 f"{path}: is not as `identify` writes it ({error}); identify again, or take it away"
             ) from None

@@ -22,6 +22,7 @@ import scipy.optimize
 from jaxpanda_kernels import Chain, regressor
 from jaxtyping import Array, Float
 
+from .. import inputs
 from ..arm import Arm
 from ..errors import InputError, require_x64
 from ..parameters import base_parameters
@@ -74,12 +75,10 @@ def load_mass_gravity(path: str | Path) -> MassGravity:
         InputError: no such file, no table, or numbers that are none.
     """
     path = Path(path)
+    arrays = inputs.read_npz(path)
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            found = {name: np.asarray(file[name], float) for name in ("q", "M", "g") if name in file}
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or 'not an .npz file'})") from None
-    except Exception:  # zip, pickle and header errors have no common class
+        found = {name: np.asarray(arrays[name], float) for name in ("q", "M", "g") if name in arrays}
+    except (TypeError, ValueError):
         raise InputError(f"{path}: is no .npz file with numbers in q, M and g") from None
     if "q" not in found or found["q"].ndim != 2:
         raise InputError(f"{path}: needs q with one row of joint positions a sample")
@@ -106,6 +105,7 @@ def mass_gravity_from_mujoco(path: str | Path, arm: Arm, q: Float[np.ndarray, "s
     import mujoco
 
     path = Path(path)
+    inputs.require_regular(path)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:

@@ -1,7 +1,6 @@
 """`Identification`: what torque or M(q), g(q) tell about an arm, and how sure that is."""
 
 import dataclasses
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,16 @@ from jaxtyping import Bool, Float
 
 from ..arm import KNOWN, Arm
 from ..errors import InputError
-from ..files import finite, output_folder, read_json, to_json
+from ..files import Kind, finite, output_folder, settle, write_json
 from ..friction import Friction
+from ..inputs import digest, read_json
 from ..parameters import coefficient_matrix, expression, linear_forms
 from .condensed import FILE as EVIDENCE_FILE
 from .condensed import Evidence
 
 SCHEMA = "jaxpanda.identification/1"
 FILE = "identification.json"
+KIND = Kind("identify", (FILE,))
 METHODS = ("mass_gravity", "trajectory", "one_step")
 RELIABLE = 0.30
 """Largest standard deviation, as a share of its value, of a coefficient that counts (Gaz et al. 2019)."""
@@ -145,11 +146,11 @@ class Identification:
     def save(self, folder: str | Path) -> Path:
         """Write `identification.json`, and the evidence as `identification.npz`; all or nothing."""
         document = self.to_json()
-        with output_folder(folder) as scratch:
+        with output_folder(folder, KIND) as scratch:
             if self.evidence is not None:
                 self.evidence.save(scratch / EVIDENCE_FILE)
-                document["evidence"] = {"file": EVIDENCE_FILE, "sha256": _digest(scratch / EVIDENCE_FILE)}
-            (scratch / FILE).write_text(to_json(document), "utf-8")
+                document["evidence"] = {"file": EVIDENCE_FILE, "sha256": digest(scratch / EVIDENCE_FILE)}
+            write_json(scratch / FILE, document)
         return Path(folder) / FILE
 
     @classmethod
@@ -163,11 +164,12 @@ class Identification:
         """
         path = Path(path)
         file = path / FILE if path.is_dir() else path
+        settle(file.parent)
         document = read_json(file)
         found = cls.from_json(document, where=str(path))
         wanted = _Reader(document, str(path)).table("evidence")
         beside = file.with_name(EVIDENCE_FILE)
-        if not wanted or not beside.is_file() or _digest(beside) != wanted.get("sha256"):
+        if not wanted or not beside.is_file() or digest(beside) != wanted.get("sha256"):
             return found
         return dataclasses.replace(found, evidence=Evidence.load(beside))
 
@@ -263,10 +265,6 @@ def _model(document: Mapping[str, Any], dof: int, where: str) -> Arm | None:
     except (LookupError, TypeError, ValueError) as error:
         raise InputError(f"{where}: model is not as `identify` writes it ({error}); identify again") from None
     return arm
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _listed(values: np.ndarray | None) -> list[float]:

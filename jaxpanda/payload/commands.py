@@ -8,9 +8,10 @@ from ..convention import PLAIN, Convention
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_folder
+from ..reading import Reading
 from ..recordings import load_many
 from .estimate import estimate_payload
-from .result import MODEL_XML, PayloadEstimate
+from .result import KIND, MODEL_XML, PayloadEstimate
 
 
 def payload_files(
@@ -21,17 +22,18 @@ def payload_files(
     *,
     frame: str,
     torque_scale_std: float,
+    reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> PayloadEstimate:
     """`jaxpanda payload`."""
     for flag, paths in (("--without", without), ("--with", loaded)):
         if not paths:
             raise InputError(f"{flag}: none given; name at least one file or folder")
-    with output_folder(out):
+    with output_folder(out, KIND) as folder:
         found = estimate_payload(
             model,
-            convention.applied(load_many(without), model),
-            convention.applied(load_many(loaded), model),
+            convention.applied(load_many(without, reading), model),
+            convention.applied(load_many(loaded, reading), model),
             frame=frame,
             torque_scale_std=torque_scale_std,
             gravity=convention.mounting,
@@ -39,5 +41,5 @@ def payload_files(
         if found.written is not None:
             missing = tuple(f"{MODEL_XML}: {what}" for what in missing_assets(found.written, out))
             found = dataclasses.replace(found, notes=(*found.notes, *missing))
-        found.save(out)  # not by way of a scratch folder: what is included may belong outside of `out`
+        found.save(folder)
     return found

@@ -16,13 +16,14 @@ from .. import markup
 from ..errors import InputError
 from ..export import write_document
 from ..feasible.nearest import are_buildable, nearest_buildable
-from ..files import write_json, write_text
+from ..files import Kind, output_folder, write_json, write_text
 from ..mjcf import MjcfSource, from_document, move_standard
 from .design import REACH
 from .frame import Frame
 
 SCHEMA = "jaxpanda.payload/1"
 JSON, XML, MODEL_XML = "payload.json", "payload.xml", "with_payload.xml"
+KIND = Kind("payload", (JSON, XML, MODEL_XML))
 EXTENT = 0.3
 """How far from its centre of mass a body at a flange is taken to reach [m], where the motion does not tell."""
 LEVEL = 0.95
@@ -178,15 +179,12 @@ class PayloadEstimate:
 
     def save(self, folder: str | Path) -> None:
         """Write payload.json, and where a body was found payload.xml and the model with it; stale ones go."""
-        folder = Path(folder)
-        if self.written is not None:
-            write_document(self.written, folder / MODEL_XML)
-        if self.snippet is not None:
-            write_text(folder / XML, self.snippet)
-        write_json(folder / JSON, self.to_json())
-        for name, made in ((XML, self.snippet), (MODEL_XML, self.written)):
-            if made is None:
-                (folder / name).unlink(missing_ok=True)
+        with output_folder(folder, KIND) as scratch:
+            if self.written is not None:
+                write_document(self.written, scratch / MODEL_XML)
+            if self.snippet is not None:
+                write_text(scratch / XML, self.snippet)
+            write_json(scratch / JSON, self.to_json())
 
 
 def result_of(

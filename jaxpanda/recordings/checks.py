@@ -29,7 +29,7 @@ _FASTEST = 10.0
 
 
 def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Recording:
-    """The same recording, once its numbers are finite, ordered, long enough and in SI units; of readings that
+    """The same recording, once it is long enough and in SI units; of readings that
     stand alone (`glitches`) the rows are left out, samples that were uniform are on their ticks (`clock`),
     and that is told.
 
@@ -41,49 +41,30 @@ def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Re
         InputError: naming file, column and row, and what would work.
     """
     row = row or (lambda i: f"row {i + 1}")
-    _finite(recording, row)
-    _ordered(recording, row)
     _rate(recording)
     _long_enough(recording)
     _unwrapped(recording, row)
     recording = without_glitches(recording)
-    _radians(recording)
-    _newton_metres(recording)
-    _velocity_unit(recording)
+    _units(recording)
     return on_clock(recording)
 
 
-def _columns(recording: Recording):
-    """Each column with the name that the canonical CSV gives it."""
-    yield "time", recording.time
-    for name, channel in (("q", recording.q), ("dq", recording.qd), ("tau", recording.tau)):
-        if channel is not None:
-            for j in range(channel.shape[1]):
-                yield f"{name}_{j + 1}", channel[:, j]
+def plausible(recording: Recording) -> Recording:
+    """The same recording, once its rate and units are those of an arm; for recordings that came from no file.
+
+    Raises:
+        InputError: naming what is not, and what would work.
+    """
+    _rate(recording)
+    _unwrapped(recording, lambda i: f"row {i + 1}")
+    _units(recording)
+    return recording
 
 
-def _finite(recording: Recording, row: Callable[[int], str]) -> None:
-    for name, column in _columns(recording):
-        bad = np.flatnonzero(~np.isfinite(column))
-        if bad.size:
-            more = f" and {bad.size - 1} more below it" if bad.size > 1 else ""
-            raise InputError(
-                f"{recording.name}: column {name}, {row(int(bad[0]))}: the value is {column[bad[0]]}{more}, "
-                "where a finite number is needed; leave out the rows that were not measured"
-            )
-
-
-def _ordered(recording: Recording, row: Callable[[int], str]) -> None:
-    back = np.flatnonzero(np.diff(recording.time) <= 0)
-    if back.size:
-        i = int(back[0]) + 1
-        before, after = float(recording.time[i - 1]), float(recording.time[i])
-        what = "repeats" if before == after else "goes back"
-        raise InputError(
-            f"{recording.name}: column time, {row(i)}: time {what} ({before!r} s, then {after!r} s; "
-            f"{back.size} such rows), where it must increase; sort the rows, drop repeated ones, or split "
-            "the file into its runs"
-        )
+def _units(recording: Recording) -> None:
+    _radians(recording)
+    _newton_metres(recording)
+    _velocity_unit(recording)
 
 
 def _rate(recording: Recording) -> None:

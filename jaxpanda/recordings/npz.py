@@ -1,34 +1,44 @@
-"""NumPy archives: arrays `time` (n,), `q`, `dq` or `qd`, `tau` (n, dof)."""
+"""NumPy archives: arrays `time` (n,), `q`, `dq` or `qd`, `tau` (n, dof); others by `--columns`."""
 
-import zipfile
-import zlib
+import io
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from .. import inputs
 from ..errors import InputError
+from ..reading import CHANNELS, Reading
 from .checks import checked
-from .recording import Recording
+from .libfranka import PANDA_PY_ARRAYS
+from .recording import Origin, Recording
+from .table import of_arrays, recording_of, refuse, within
 
 _ALIASES = {"time": ("time",), "q": ("q",), "dq": ("dq", "qd"), "tau": ("tau",)}
 
 
-def read_npz(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
+def read_npz(path: Path, reading: Reading) -> list[Recording]:
     """A recording from `.npz`; pickled objects are never loaded.
-
-    Args:
-        path: the file.
-        columns: {time, q, dq or tau: name of the array in the file} where the two differ.
 
     Raises:
         InputError: naming the file and the array, and what would work.
     """
-    arrays = _arrays(path, columns)
+    refuse(path.name, reading, "topic", "episode")
+    archive = inputs.read_npz(path)
+    if not (reading.columns or "tau_J" in archive):
+        return [_canonical(path, {channel: _array(archive, channel, path) for channel in _ALIASES}, reading)]
+    numeric = {k: v for k, v in archive.items() if v.dtype.kind in "fiu" and v.ndim in (1, 2)}
+    shapes = {name: array.shape for name, array in numeric.items()}
+    table = of_arrays(path, path.name, shapes, numeric.__getitem__)
+    return [recording_of(table, (PANDA_PY_ARRAYS,), reading)]
+
+
+def _canonical(path: Path, arrays: dict[str, np.ndarray | None], reading: Reading) -> Recording:
     for channel in ("time", "q"):
         if arrays[channel] is None:
             raise InputError(
-                f"{path.name}: no array {channel}; arrays time (n,), q, dq, tau (n, joints) are needed"
+                f"{path.name}: no array {channel}; arrays time (n,), q, dq, tau (n, joints) are needed, or "
+                "--columns that say which is which"
             )
     time, q = arrays["time"], arrays["q"]
     assert time is not None
@@ -42,36 +52,17 @@ def read_npz(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
             raise InputError(
                 f"{path.name}: array {channel} has the shape {array.shape}, where {shape} is needed"
             )
-    return checked(Recording(path.name, time, q, arrays["dq"], arrays["tau"], path))
+    origin = Origin("canonical arrays", {c: c for c in CHANNELS if arrays[c] is not None}, "measured")
+    rows, notes = within(path.name, time, reading)
+    row = lambda i: f"row {i + rows.start + 1}"
+    q, qd, tau = (None if (array := arrays[c]) is None else array[rows] for c in ("q", "dq", "tau"))
+    assert q is not None
+    recording = Recording(path.name, time[rows], q, qd, tau, path, notes=notes, origin=origin, row=row)
+    return checked(recording, row)
 
 
-def _arrays(path: Path, columns: Mapping[str, str] | None) -> dict[str, np.ndarray | None]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(
-                    f"{path.name}: a single array, where an archive with time, q, dq, tau is needed"
-                )
-            return {channel: _array(archive, channel, path, columns) for channel in _ALIASES}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path.name}: no NumPy archive, or a broken one ({error})") from None
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(
-            f"{path.name}: holds no plain arrays ({error}): save numbers only, no objects"
-        ) from None
-
-
-def _array(archive, channel: str, path: Path, columns: Mapping[str, str] | None) -> np.ndarray | None:
-    asked = (columns or {}).get(channel)
-    if asked is not None and asked not in archive.files:
-        raise InputError(
-            f"{path.name}: no array {asked!r} (asked for as {channel}); it has {', '.join(archive.files)}"
-        )
-    present = [asked] if asked else [name for name in _ALIASES[channel] if name in archive.files]
+def _array(archive: Mapping[str, np.ndarray], channel: str, path: Path) -> np.ndarray | None:
+    present = [name for name in _ALIASES[channel] if name in archive]
     if not present:
         return None
     if len(present) > 1:
@@ -84,8 +75,8 @@ def _array(archive, channel: str, path: Path, columns: Mapping[str, str] | None)
     return np.asarray(array, dtype=float)
 
 
-def write_npz(recording: Recording, path: Path) -> None:
+def npz_bytes(recording: Recording, name: str) -> bytes:
     """The archive that `read_npz` reads."""
     arrays = {"time": recording.time, "q": recording.q, "dq": recording.qd, "tau": recording.tau}
-    with path.open("wb") as file:
-        np.savez_compressed(file, **{name: array for name, array in arrays.items() if array is not None})
+    np.savez_compressed(out := io.BytesIO(), **{name: a for name, a in arrays.items() if a is not None})
+    return out.getvalue()

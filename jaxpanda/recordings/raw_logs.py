@@ -4,17 +4,20 @@ A file holds one number a line (`dof` consecutive numbers are a sample) or one s
 host stamped: true ticks are reconstructed where they can be and are better (`ticks`).
 """
 
+import dataclasses
 import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
+from ..reading import Reading
 from .checks import checked
-from .recording import Recording
+from .recording import Origin, Recording
+from .table import chosen, cut, refuse
 from .text import numbers, read_text
 from .ticks import Ticks, consistent, reconstruct
 
@@ -41,17 +44,18 @@ _SUFFIX = re.compile(r"\.(txt|dat|log)(\.gz)?$", re.IGNORECASE)
 _SLACK = 5  # rows by which the files of one log may differ in length
 
 
-def read_raw_logs(path: Path, columns: Mapping[str, str] | None = None) -> list[Recording]:
-    """The runs logged in a folder; a new run begins where time goes back.
+def read_raw_logs(path: Path, reading: Reading) -> list[Recording]:
+    """The runs logged in a folder; a new run begins where time goes back, and is an episode from 1 on.
 
     Args:
         path: the folder.
-        columns: {time, q, dq or tau: file name} where the names do not say it.
+        reading: `columns` names the file of a channel where the names do not say it.
 
     Raises:
         InputError: naming the folder or file and the row, and what would work.
     """
-    files = find_logs(path, columns)
+    refuse(path.name, reading, "topic")
+    files = find_logs(path, reading.channels())
     time = _numbers(files["time"], "time")
     if time.shape[1] != 1:
         raise InputError(f"{files['time'].name}: {time.shape[1]} numbers a line, where time has one")
@@ -60,17 +64,26 @@ def read_raw_logs(path: Path, columns: Mapping[str, str] | None = None) -> list[
         for channel, file in files.items()
     }
     rows = min(map(len, logs.values()))
-    cut = sum(len(log) - rows for log in logs.values())
+    short = sum(len(log) - rows for log in logs.values())
     logs = {channel: log[:rows] for channel, log in logs.items()}
     _same_joints(logs, files)
     stamps = logs["time"][:, 0]
     breaks = [0, *(np.flatnonzero(np.diff(stamps) < 0) + 1).tolist(), rows]
     runs = []
+    wanted = (
+        chosen(path.name, [str(k) for k in range(1, len(breaks))], reading, "runs")
+        if reading.episode
+        else None
+    )
+    origin = Origin("a folder of logs", {channel: file.name for channel, file in files.items()})
     for number, (start, stop) in enumerate(itertools.pairwise(breaks), 1):
+        if wanted is not None and str(number) not in wanted:
+            continue
         name = path.name if len(breaks) == 2 else f"{path.name} (run {number})"
         run = {channel: log[start:stop] for channel, log in logs.items()}
-        recording = Recording(name, stamps[start:stop], run["q"], run.get("dq"), run.get("tau"), path)
-        runs.append(_on_ticks(recording, start, {"rows cut to the shortest file": cut} if cut else {}))
+        logged = _Run(name, stamps[start:stop], run["q"], run.get("dq"), run.get("tau"), path, origin)
+        repairs = {"rows cut to the shortest file": short} if short else {}
+        runs.append(cut(_on_ticks(logged, start, repairs), reading))
     return runs
 
 
@@ -88,6 +101,9 @@ def find_logs(path: Path, columns: Mapping[str, str] | None = None) -> dict[str,
     files = sorted(file for file in path.iterdir() if _SUFFIX.search(file.name) and file.is_file())
     found = {channel: _unzipped_first([file for file in files if _is(file, channel)]) for channel in _WORDS}
     for channel, name in (columns or {}).items():
+        if not name:
+            found[channel] = []
+            continue
         if not (path / name).is_file():
             raise InputError(f"{path}: no file {name!r} (asked for as {channel}) in this folder")
         found[channel] = [path / name]
@@ -107,8 +123,8 @@ def find_logs(path: Path, columns: Mapping[str, str] | None = None) -> dict[str,
         if len(likely) > 1:
             names = ", ".join(file.name for file in likely)
             raise InputError(
-                f"{path}: {names} could each be {channel}: move the others away, or say which from Python: "
-                f"load(path, columns={{'{channel}': 'the file meant'}})"
+                f"{path}: {names} could each be {channel}: move the others away, or say which by"
+                f" --columns {channel}=FILE"
             )
         if likely:
             chosen[channel] = likely[0]
@@ -181,17 +197,37 @@ def _same_joints(logs: Mapping[str, np.ndarray], files: Mapping[str, Path]) -> N
             )
 
 
-def _on_ticks(recording: Recording, start: int, repairs: dict[str, int]) -> Recording:
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """Rows as they were logged, whose stamps may repeat."""
+
+    name: str
+    time: Float[np.ndarray, " time"]
+    q: Float[np.ndarray, "time dof"]
+    qd: Float[np.ndarray, "time dof"] | None
+    tau: Float[np.ndarray, "time dof"] | None
+    path: Path
+    origin: Origin
+
+    def recording(
+        self, row: Callable[[int], str], repairs: Mapping[str, int], notes: tuple[str, ...] = ()
+    ) -> Recording:
+        channels = (self.time, self.q, self.qd, self.tau)
+        made = Recording(self.name, *channels, self.path, repairs, notes, origin=self.origin, row=row)
+        return checked(made, row)
+
+
+def _on_ticks(run: _Run, start: int, repairs: dict[str, int]) -> Recording:
     """The recording with its rows on true ticks if that is better than the stamps, checked either way."""
     row = lambda i: f"row {start + i + 1}"
-    if recording.qd is None or recording.samples < 40 or consistent(recording.time):
-        return checked(_replace(recording, repairs), row)
-    ticks = reconstruct(recording.time, recording.q, recording.qd, recording.tau)
+    if run.qd is None or len(run.time) < 40 or consistent(run.time):
+        return run.recording(row, repairs)
+    ticks = reconstruct(run.time, run.q, run.qd, run.tau)
     if ticks is None:
-        return checked(_replace(recording, repairs), row)
+        return run.recording(row, repairs)
     evidence = _evidence(ticks)
     if not ticks.better:
-        return checked(_replace(recording, repairs, (f"the stamps are kept: {evidence}",)), row)
+        return run.recording(row, repairs, (f"the stamps are kept: {evidence}",))
     new = np.concatenate([[True], np.diff(ticks.tick) > 0])
     repairs |= {
         "repeated rows dropped": int(np.sum(~new)),
@@ -199,29 +235,15 @@ def _on_ticks(recording: Recording, start: int, repairs: dict[str, int]) -> Reco
         "rows at rest put on a tick by their stamp": ticks.stamped,
         "ticks missing between rows": int(ticks.tick[-1] + 1 - np.sum(new)),
     }
-    moved = Recording(
-        recording.name,
-        ticks.tick[new] * ticks.period,
-        recording.q[new],
-        recording.qd[new],
-        None if recording.tau is None else recording.tau[new],
-        recording.path,
-        repairs,
-        (f"rows are on reconstructed ticks: {evidence}",),
+    moved = dataclasses.replace(
+        run,
+        time=ticks.tick[new] * ticks.period,
+        q=run.q[new],
+        qd=run.qd[new],
+        tau=None if run.tau is None else run.tau[new],
     )
-    return checked(moved)
-
-
-def _replace(recording: Recording, repairs: dict[str, int], notes: tuple[str, ...] = ()) -> Recording:
-    return Recording(
-        recording.name,
-        recording.time,
-        recording.q,
-        recording.qd,
-        recording.tau,
-        recording.path,
-        repairs,
-        notes,
+    return moved.recording(
+        lambda i: f"row {i + 1}", repairs, (f"rows are on reconstructed ticks: {evidence}",)
     )
 
 

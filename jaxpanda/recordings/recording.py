@@ -1,13 +1,38 @@
 """`Recording`: what an arm's log says, in SI units, with an account of what reading it took."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
+
+Torque = Literal["measured", "gravity_removed", "current", "commanded", "motor_side", "unstated"]
+"""What a source says its torque is; `measured` is what a recording's must be."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Which of a log's columns a recording was made of, and what the log's source says they are."""
+
+    source: str
+    """Who writes such logs, or who says what the columns are."""
+    channels: Mapping[str, str]
+    """Of time, q, dq and tau, the columns they were taken from."""
+    torque: Torque = "unstated"
+    says: str = ""
+    """Of torque, in words."""
+
+    def lines(self) -> list[str]:
+        """For who looks at a recording."""
+        took = "; ".join(f"{channel} from {columns}" for channel, columns in self.channels.items())
+        return [f"taken for {self.source}: {took}", *([f"its source says: {self.says}"] if self.says else [])]
+
+    def to_json(self) -> dict[str, Any]:
+        return {**dataclasses.asdict(self), "channels": dict(self.channels)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,6 +40,10 @@ class Recording:
     """Channels of one motion of an arm, as logged; nothing in it is filtered or resampled.
 
     `time` increases strictly but need not be uniform.
+
+    Raises:
+        InputError: on construction, where channels differ in length or joints, a number is not finite, or time
+            does not increase; naming the column and the row, as `row` counts them.
     """
 
     name: str
@@ -34,6 +63,60 @@ class Recording:
     """What else reading found out, and the evidence for the repairs, in plain words."""
     stamps: Float[np.ndarray, " time"] | None = None
     """Time as it was written [s], where rows were moved to ticks; else None."""
+    origin: Origin | None = None
+    """What a file called the channels; None where the recording comes from no file."""
+    row: dataclasses.InitVar[Callable[[int], str] | None] = None
+    """How the file counts sample `i` (0-based), for messages."""
+
+    def __post_init__(self, row: Callable[[int], str] | None):
+        for name in ("time", "q", "qd", "tau", "stamps"):
+            object.__setattr__(self, name, _array(getattr(self, name), name, self.name))
+        self._require_shapes()
+        row = row or (lambda i: f"row {i + 1}")
+        self._require_finite(row)
+        self._require_order(row)
+
+    def _require_shapes(self) -> None:
+        if self.time.ndim != 1 or self.q.ndim != 2 or self.q.shape[1] == 0:
+            raise InputError(
+                f"{self.name}: time has the shape {self.time.shape} and q {self.q.shape}, where (n,) and "
+                "(n, joints) are needed"
+            )
+        for name, channel in (("q", self.q), ("dq", self.qd), ("tau", self.tau)):
+            if channel is not None and channel.shape != (self.samples, self.dof):
+                raise InputError(
+                    f"{self.name}: {name} has the shape {channel.shape}, where "
+                    f"{(self.samples, self.dof)} is needed, a row for each time and a column for each joint"
+                )
+
+    def _require_finite(self, row: Callable[[int], str]) -> None:
+        for name, column in self.columns():
+            bad = np.flatnonzero(~np.isfinite(column))
+            if bad.size:
+                more = f" and {bad.size - 1} more below it" if bad.size > 1 else ""
+                raise InputError(
+                    f"{self.name}: column {name}, {row(int(bad[0]))}: the value is {column[bad[0]]}{more}, "
+                    "where a finite number is needed; leave out the rows that were not measured"
+                )
+
+    def _require_order(self, row: Callable[[int], str]) -> None:
+        back = np.flatnonzero(np.diff(self.time) <= 0)
+        if back.size:
+            i = int(back[0]) + 1
+            before, after = float(self.time[i - 1]), float(self.time[i])
+            what = "repeats" if before == after else "goes back"
+            raise InputError(
+                f"{self.name}: column time, {row(i)}: time {what} ({before!r} s, then {after!r} s; "
+                f"{back.size} such rows), where it must increase; sort the rows, drop repeated ones, or split "
+                "the file into its runs"
+            )
+
+    def columns(self) -> Iterator[tuple[str, Float[np.ndarray, " time"]]]:
+        """Each column with the name that the canonical CSV gives it."""
+        yield "time", self.time
+        for name, channel in (("q", self.q), ("dq", self.qd), ("tau", self.tau)):
+            if channel is not None:
+                yield from ((f"{name}_{j + 1}", channel[:, j]) for j in range(channel.shape[1]))
 
     @property
     def dof(self) -> int:
@@ -63,8 +146,18 @@ class Recording:
     def require_tau(self) -> Float[np.ndarray, "time dof"]:
         """The measured torque; refuse a motion."""
         if self.tau is None:
+            said = f" ({self.origin.says})" if self.origin and self.origin.says else ""
             raise InputError(
                 f"{self.name}: no columns tau_1 ... tau_{self.dof}: this needs measured joint torques, not a "
-                "motion"
+                f"motion{said}"
             )
         return self.tau
+
+
+def _array(values: Any, channel: str, name: str) -> np.ndarray | None:
+    if values is None:
+        return None
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: {channel} is no array of numbers") from None

@@ -1,12 +1,11 @@
 """Bytes of a text file, plain or gzipped, into numbers, with the place of whatever is none."""
 
-import gzip
-import zlib
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from .. import inputs
 from ..errors import InputError
 
 
@@ -16,30 +15,7 @@ def read_text(path: Path) -> str:
     Raises:
         InputError: the file is missing, unreadable, a broken gzip file, empty, or no text.
     """
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    if path.suffix == ".gz":
-        try:
-            content = gzip.decompress(content)
-        except (OSError, EOFError, zlib.error) as error:
-            raise InputError(
-                f"{path.name}: a broken or truncated gzip file ({error}): copy it again"
-            ) from None
-    if not content.strip():
-        raise InputError(f"{path.name}: the file is empty")
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path.name}: no text (byte {error.start} is not UTF-8): save the recording as UTF-8 CSV"
-        ) from None
-    if "\0" in text:
-        raise InputError(f"{path.name}: binary data, no text: save the recording as UTF-8 CSV")
-    return text
+    return inputs.read_text(path, what="a recording as UTF-8 CSV")
 
 
 def numbers(
