@@ -5,13 +5,13 @@ Every joint is compared by itself. Samples of its low-passed torque are explaine
 $$ \tau = \mu + B\,x + e, \quad x \sim N(0, 1), \quad e \sim N(0, a^2 R_\rho), $$
 
 with $\mu$ the torque of the user's model under a reading of the column. B is what may well be wrong in a model
-that is read rightly: links, a payload, friction, an offset, rotor inertia, a spring, a delay, a gain and a slight
-tilt, all with wide deviations. The error e is correlated over a time $\rho$; its size and $\rho$ are integrated
-out, so that unmodelled physics only makes e larger, whatever the reading. A column in another unit or of another
-joint is far from any of this, and its reading gains many nats over the plain one.
+that is read rightly: links, a payload, friction and whatever load it holds at rest, an offset, rotor inertia, a
+spring, a delay, a gain and a slight tilt, all with wide deviations. The error e is correlated over a time $\rho$;
+its size and $\rho$ are integrated out, so that unmodelled physics only makes e larger, whatever the reading. A
+column in another unit or of another joint is far from any of this, and its reading gains many nats.
 
-The likeliest reading is told only where its evidence beats the plain one's by far (`_NEEDS`) and the posterior of
-the plain one is next to none (`SURE`); its own posterior is its confidence.
+The likeliest reading is told only where its evidence beats the plain one's by far, more for each choice it has
+(`_NEEDS`), and the posterior of the plain one is next to none (`SURE`); its own posterior is its confidence.
 """
 
 import dataclasses
@@ -63,8 +63,8 @@ _MEMORIES = np.array([0.05, 0.2, 0.8, 3.2])
 _SIZES = np.exp(np.arange(np.log(1e-6), np.log(2e4), 0.5))
 """Sizes of the error, in the size of the joint's torque; the least are none, lest a factor stand in for them."""
 _SHARES = np.geomspace(0.03, 8.0, 8)
-"""Shares of the deviations below that a joint may have. Most models are better than that, and some are far worse: a
-factor would be told for these, as it makes the deviations larger."""
+"""Shares of the deviations below that a joint may have. Most models are better than that, and some far worse: for
+these a factor would be told, as it makes the deviations larger."""
 _WHITE = 0.03
 """Share of the error's variance that is not correlated."""
 _LINKS = 0.2, 0.02, 0.3
@@ -197,20 +197,22 @@ def meaning(recording: Recording, arm: Arm) -> Meaning | None:
     with threadpool_limits(limits=1, user_api="blas"):  # for small matrices several cost more than they save
         readings = _readings(model)
     plain = readings[0]
-    scores = np.array([r.score for r in readings])
+    scores = np.array([r.score - _needs(r) for r in readings])
     best = readings[int(np.argmax(scores))]
     kinds = np.array([r.kind for r in readings])
     alike = _logsumexp(scores[kinds == best.kind])
     confidence = float(np.exp(alike - _logsumexp(scores)))
-    gain = best.score - plain.score
     unlikely = plain.score - _logsumexp(scores)
-    if not best.kind or unlikely > np.log(1 - SURE) or confidence < 0.5 or gain < _needs(best):
+    if not best.kind or unlikely > np.log(1 - SURE) or confidence < 0.5:
         return None
+    gain = best.score - plain.score
     return _told(best, model, min(confidence, 0.995), float(gain))
 
 
 def _needs(reading: "_Reading") -> float:
     """Evidence over the plain reading that one needs, by its choices: which joints, a constant each [nats]."""
+    if not reading.kind:
+        return 0.0
     altered = len(_altered(reading))
     choices = {
         "gravity_removed": 1,
