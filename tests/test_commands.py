@@ -147,7 +147,13 @@ def test_the_chain_of_commands_leaves_what_the_interface_promises(capsys, record
     assert max(checked["rollout_rmse_rad"]) < 0.2
 
 
-@pytest.mark.parametrize("own", [True, False], ids=["the project's Panda", "an arm of the user's"])
+@pytest.mark.parametrize(
+    "own",
+    [
+        pytest.param(True, marks=pytest.mark.slow, id="the project's Panda"),
+        pytest.param(False, id="an arm of the user's"),
+    ],
+)
 def test_the_readme_s_example_runs_for_any_arm(own, recording, tmp_path, monkeypatch):
     """Of a user's arm it ended in "bounds: none are known for the arm"."""
     monkeypatch.chdir(tmp_path)

@@ -151,6 +151,7 @@ def test_a_contact_is_found_in_its_interval_and_kept_out_of_predictions(tmp_path
     np.testing.assert_allclose(np.sqrt(np.mean(error**2, 0)), NOISE, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_what_no_effect_explains_is_called_unknown():
     def odd_one(t, q, qd, qdd):
         return 0.3 * np.tanh(qd[:, 2] / 0.01) * np.sin(4 * q[:, 2])
@@ -172,7 +173,7 @@ def notched(t, q, qd, qdd):
     return 0.4 * x * np.exp(-0.5 * x**2)
 
 
-@pytest.mark.parametrize("law", [coupled, notched])
+@pytest.mark.parametrize("law", [pytest.param(coupled, marks=pytest.mark.slow), notched])
 def test_a_torque_without_a_name_is_predicted_in_a_motion_never_seen(law, tmp_path):
     result = diagnose(None, [record(0, at_joint(3, law)), record(1, at_joint(3, law))])
     assert {(f.effect, f.joints) for f in result.findings} == {("unknown", (2,))}
@@ -202,7 +203,8 @@ PLANAR = """<mujoco><compiler angle="radian"/><worldbody><body>
 
 
 @pytest.mark.parametrize(
-    ("gain", "rub", "named"), [(1.5, 0.3, "inertial_parameters"), (1.0, 0.0, "coulomb_friction")]
+    ("gain", "rub", "named"),
+    [pytest.param(1.5, 0.3, "inertial_parameters", marks=pytest.mark.slow), (1.0, 0.0, "coulomb_friction")],
 )
 def test_a_model_whose_own_numbers_are_wrong_is_not_consistent(gain, rub, named, tmp_path):
     """Refitting them explains all, and so nothing was found."""

@@ -110,6 +110,7 @@ def test_the_terminal_says_what_robots_take(files, tmp_path, capsys):
         assert words in said
 
 
+@pytest.mark.slow
 def test_intervals_of_twenty_pairs_hold_the_truth(tmp_path):
     inside, off = [], []
     for seed in range(100, 120):

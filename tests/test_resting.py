@@ -91,7 +91,7 @@ def test_an_arm_at_rest_is_answered_and_its_prediction_is_the_users_model(rubbin
     assert np.abs(predict(out, motion) - held).max() < LOSS + 0.05
 
 
-@pytest.mark.parametrize("slow", [False, True])
+@pytest.mark.parametrize("slow", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_noise_and_friction_at_rest_raise_no_alarm(rubbing, slow):
     found = [judged(rubbing, rest(seed, slow=slow)) for seed in range(12)]
     assert [one.verdict for one in found] == ["consistent"] * 12
