@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+import jaxpanda
+
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
     path
@@ -48,3 +50,10 @@ def test_the_checks_find_their_commands_in_the_readme(mark, starts):
     )
     assert found.stdout.startswith(starts)
     assert found.stdout.count("\n") == 1
+
+
+def test_every_public_name_is_in_the_reference():
+    text = (ROOT / "docs" / "api.md").read_text()
+    assert [
+        name for name in dir(jaxpanda) if not re.search(rf":: jaxpanda\.{name}$", text, re.MULTILINE)
+    ] == []
