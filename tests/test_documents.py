@@ -1,9 +1,11 @@
 """The README and the documents: short enough, and every link leads somewhere."""
 
+import json
 import re
 import subprocess
 from pathlib import Path
 
+import jsonschema
 import pytest
 
 import jaxpanda
@@ -57,3 +59,9 @@ def test_every_public_name_is_in_the_reference():
     assert [
         name for name in dir(jaxpanda) if not re.search(rf":: jaxpanda\.{name}$", text, re.MULTILINE)
     ] == []
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("docs/schemas/*.json")), ids=lambda path: path.name)
+def test_every_schema_is_one_and_is_told_of(path):
+    jsonschema.Draft202012Validator.check_schema(json.loads(path.read_text()))
+    assert f"schemas/{path.name}" in (ROOT / "docs" / "schemas.md").read_text()
