@@ -32,7 +32,8 @@ myst_heading_anchors = 3
 
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 120
+nb_execution_timeout = 240
+nb_execution_in_temp = True
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
