@@ -22,6 +22,7 @@ exclude_patterns = [".*", "build", "dist", "**/__pycache__"]
 html_theme = "furo"
 html_math_renderer = "mathml"
 html_title = "jaxpanda"
+html_static_path, html_css_files = ["static"], ["site.css"]
 html_extra_path = ["llms.txt", "schemas"]
 html_copy_source = html_show_sourcelink = False
 html_additional_pages = {"index": "to_start.html"}
