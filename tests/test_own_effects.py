@@ -90,7 +90,7 @@ def test_an_effect_of_one_s_own_is_named_located_and_fitted(found):
 def test_it_stands_in_the_tables_and_on_the_page(found):
     assert "coupled_damping" in found.heat_map.effects
     assert "coupled_damping" in {one.effect for one in found.least_shown}
-    assert any("coupled damping" in section.title for section in page.sections(found))
+    assert any("coupled damping" in section.heading for section in page.sections(found))
 
 
 @pytest.mark.slow
