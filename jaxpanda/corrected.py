@@ -15,12 +15,12 @@ from jaxtyping import Array, Float
 from . import files
 from .arm import FRICTION_LAW, NUMBERS, Arm
 from .effects import (
-    CATALOGUE,
     AbstractEffect,
     AbstractJointEffect,
     Channels,
     Motion,
     Stretches,
+    catalogue_with,
     joint_columns,
     sign_over_velocity,
     smooth_torque,
@@ -208,33 +208,38 @@ class Corrected(eqx.Module):
         }
 
     @classmethod
-    def load(cls, folder: str | Path) -> "Corrected":
-        """The corrected arm in a folder that `diagnose` wrote.
+    def load(cls, folder: str | Path, effects: Sequence[type[AbstractEffect]] = ()) -> "Corrected":
+        """The corrected arm in a folder that `diagnose` wrote; `effects`: classes of your own that it was given.
 
         Raises:
-            InputError: there is none, or not as `diagnose` writes it.
+            InputError: there is none, or not as `diagnose` writes it, or an effect is of an unknown class.
         """
-        return read(folder)[0]
+        return read(folder, effects)[0]
 
     @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> "Corrected":
-        """The inverse of `to_json`."""
-        effects = [effect_from_json(e) for e in document["effects"]]
+    def from_json(
+        cls, document: Mapping[str, Any], effects: Sequence[type[AbstractEffect]] = ()
+    ) -> "Corrected":
+        """The inverse of `to_json`; `effects`: classes beside those of the catalogue."""
+        classes = {c.__name__: c for c in catalogue_with(effects)}
+        found = [effect_from_json(e, classes) for e in document["effects"]]
         return cls(
             Arm.from_json(document["arm"]),
             jnp.asarray(document["change"]),
             jnp.asarray(document["damping_change"]),
             jnp.asarray(document["frictionloss_change"]),
-            tuple(effects),
+            tuple(found),
             tuple(jnp.asarray(e["coefficients"], float) for e in document["effects"]),
         )
 
 
-def read(folder: str | Path) -> tuple[Corrected, Float[np.ndarray, " dof"]]:
-    """The corrected arm that `diagnose` saved, and the noise of its torque [N m].
+def read(
+    folder: str | Path, effects: Sequence[type[AbstractEffect]] = ()
+) -> tuple[Corrected, Float[np.ndarray, " dof"]]:
+    """The corrected arm that `diagnose` saved, and the noise of its torque [N m]; called like `Corrected.load`.
 
     Raises:
-        InputError: there is none, or not as `diagnose` writes it.
+        InputError: there is none, or not as `diagnose` writes it, or an effect is of an unknown class.
     """
     path = Path(folder) / FILE
     files.settle(folder)
@@ -242,8 +247,10 @@ def read(folder: str | Path) -> tuple[Corrected, Float[np.ndarray, " dof"]]:
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise InputError(f"{path}: is no corrected model; a folder that `diagnose` wrote is needed")
     try:
-        found, noise = Corrected.from_json(document), np.asarray(document["torque_noise"], float)
+        found, noise = Corrected.from_json(document, effects), np.asarray(document["torque_noise"], float)
         _check_numbers(found, noise)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{path}: is not as `diagnose` writes it ({type(error).__name__}: {' '.join(str(error).split())});"
@@ -417,11 +424,17 @@ class Plant(eqx.Module):
         return Channels(t, q, qd, qdd, load, load)
 
 
-def effect_from_json(document: Mapping[str, Any]) -> AbstractEffect:
-    """The effect that `to_json` of it says."""
-    classes = {c.__name__: c for c in CATALOGUE}
+def effect_from_json(
+    document: Mapping[str, Any], classes: Mapping[str, type[AbstractEffect]]
+) -> AbstractEffect:
+    """The effect that `to_json` of it says, of one of these classes, by their names."""
+    if (name := document["class"]) not in classes:
+        raise InputError(
+            f"no effect of jaxpanda is of class {name!r}; where it is your own, pass effects=[{name}] to"
+            " Corrected.load, predict or replay in Python"
+        )
     fields = {k: _tupled(v) for k, v in document.items() if k not in ("class", "coefficients")}
-    return classes[document["class"]](**fields)
+    return classes[name](**fields)
 
 
 def _tupled(value: Any) -> Any:

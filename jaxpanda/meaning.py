@@ -62,7 +62,7 @@ _MEMORIES = np.array([0.05, 0.2, 0.8, 3.2])
 """Correlation times of the error [s]."""
 _SIZES = np.exp(np.arange(np.log(1e-6), np.log(2e4), 0.5))
 """Sizes of the error, in the size of the joint's torque; the least are none, lest a factor stand in for them."""
-_SHARES = np.geomspace(0.03, 8.0, 8)
+_SHARES = np.geomspace(1e-3, 8.0, 12)
 """Shares of the deviations below that a joint may have. Most models are better than that, and some far worse: for
 these a factor would be told, as it makes the deviations larger."""
 _WHITE = 0.03

@@ -22,7 +22,7 @@ and differentiated in any number of the `Plant`.
 import copy
 import dataclasses
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,7 +36,7 @@ from jaxtyping import Array, Float
 
 from .arm import Arm
 from .corrected import XML, Corrected, Plant, read
-from .effects import masses, slopes
+from .effects import AbstractEffect, masses, slopes
 from .errors import InputError, require_x64
 from .export import dry_friction
 from .mjcf import (
@@ -133,6 +133,7 @@ def replay(
     engine: Engine = "mujoco",
     seconds: float = SECONDS,
     start: float | None = None,
+    effects: Sequence[type[AbstractEffect]] = (),
 ) -> Replay:
     """Replay a recording in the corrected simulation.
 
@@ -145,12 +146,13 @@ def replay(
         seconds: length, at most.
         start: of the replay, by the recording's clock [s]; by default such that what happened in the recording is
             in it, or its beginning.
+        effects: classes of your own that `diagnose` was given, where `diagnosis` is a folder.
 
     Raises:
         InputError: no diagnosis or model, a recording that does not fit, or a motion that ran away.
     """
     require_x64("a replay")
-    corrected, source = _opened(diagnosis, model)
+    corrected, source = _opened(diagnosis, model, effects)
     recording = recording if isinstance(recording, Recording) else load_recording(recording)
     recording.require_dof(corrected.arm.dof)
     recording.require_tau()
@@ -323,14 +325,16 @@ def stable(gains: Gains, recording: Recording, arm: Arm, dt: float) -> Gains:
 
 
 def _opened(
-    diagnosis: str | Path | Corrected, model: str | Path | MjcfSource | None
+    diagnosis: str | Path | Corrected,
+    model: str | Path | MjcfSource | None,
+    effects: Sequence[type[AbstractEffect]] = (),
 ) -> tuple[Corrected, MjcfSource]:
     if isinstance(diagnosis, Corrected):
         if model is None:
             raise InputError("a replay of a corrected arm needs the MJCF of the arm: give model=")
         corrected = diagnosis
     else:
-        corrected = read(diagnosis)[0]
+        corrected = read(diagnosis, effects)[0]
         model = Path(diagnosis) / XML if model is None else model
     return corrected, model if isinstance(model, MjcfSource) else from_mjcf(model)[1]
 

@@ -19,6 +19,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -437,10 +438,26 @@ def mjx_package(model: mujoco.MjModel) -> tuple[Any, list[str]]:
     except ImportError as error:
         return None, [f"not checked in MJX, which cannot be imported ({error}): pip install mujoco-mjx"]
     try:
+        assert_versions_belong_together(*(metadata.version(name) for name in ("mujoco", "mujoco-mjx")))
         assert_mjx_supported(model)
     except InputError as error:
         return None, [f"not checked in MJX: {error}"]
     return mjx, []
+
+
+def assert_versions_belong_together(mujoco_version: str, mjx_version: str) -> None:
+    """Refuse an MJX that is newer than MuJoCo, whose models it may not know how to read.
+
+    Raises:
+        InputError: with the command that mends it.
+    """
+    engine, mjx = (tuple(map(int, v.split(".")[:2])) for v in (mujoco_version, mjx_version))
+    if mjx > engine:
+        needed = ".".join(map(str, mjx))
+        raise InputError(
+            f"mujoco-mjx {mjx_version} needs MuJoCo {needed} or newer, and {mujoco_version} is installed:"
+            f" pip install 'mujoco>={needed}'"
+        )
 
 
 def jit_mjx(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,9 +1,12 @@
 """Random arms and states, and the same arms in other people's engines."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jsonschema
 import mujoco
 import numpy as np
 from jaxpanda_kernels import Chain, inertia
@@ -15,6 +18,14 @@ from jaxpanda.effects import Motion
 
 NOISE = 0.05
 """Of the torque that `record` makes [N m]."""
+
+
+def result(path: Path) -> dict[str, Any]:
+    """A result's document, held against its schema in `docs/schemas/`."""
+    document = json.loads(path.read_text())
+    schema = Path(__file__).parents[1] / "docs" / "schemas" / f"{path.stem}.schema.json"
+    jsonschema.Draft202012Validator(json.loads(schema.read_text())).validate(document)
+    return document
 
 
 def random_chain(seed: int, dof: int) -> Chain:

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from helpers import excitation
+from helpers import excitation, result
 
 import jaxpanda
 from jaxpanda.__main__ import main
@@ -119,7 +119,7 @@ def test_inspect_prints_one_json_document_and_nothing_else(capsys, recording):
 def test_the_chain_of_commands_leaves_what_the_interface_promises(capsys, recording, tmp_path):
     run, model = tmp_path / "run", tmp_path / "found.xml"
     assert main(["identify", "--recording", str(recording), "--out", str(run), "--folds", "0"]) == 0
-    found = json.loads((run / "identification.json").read_text())
+    found = result(run / "identification.json")
     assert found["schema"] == "jaxpanda.identification/1"
     assert found["method"] == "trajectory"
     assert len(found["coefficients"]) == found["rank"]
@@ -127,7 +127,7 @@ def test_the_chain_of_commands_leaves_what_the_interface_promises(capsys, record
 
     file = str(run / "identification.json")
     assert main(["retrieve", "--identification", file, "--starts", "8", "--out", str(run)]) == 0
-    links = json.loads((run / "retrieval.json").read_text())
+    links = result(run / "retrieval.json")
     assert links["max_violation"] == 0
     assert len(links["links"]) == 7
 
@@ -140,7 +140,7 @@ def test_the_chain_of_commands_leaves_what_the_interface_promises(capsys, record
     )
     out, _ = capsys.readouterr()
     checked = json.loads(out)
-    assert checked == json.loads((run / "validation.json").read_text())
+    assert checked == result(run / "validation.json")
     assert checked["kernel_vs_mujoco"] < 1e-9
     assert checked["mjx_vs_mujoco"] < 1e-9
     assert checked["relative_error_percent"] < 5

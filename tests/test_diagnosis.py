@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import NOISE, excitation, record
+from helpers import result as held
 
 from jaxpanda import Arm, InputError, Recording, markup
 from jaxpanda.corrected import Corrected
@@ -86,8 +87,9 @@ def test_the_error_falls_to_the_noise_on_what_was_held_out(found):
 
 def test_prediction_from_the_saved_folder_reproduces_a_motion_never_seen(found, tmp_path):
     found.save(tmp_path / "out")
-    document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    document = held(tmp_path / "out" / "diagnosis.json")
     assert document["schema"] == "jaxpanda.diagnosis/1"
+    assert held(tmp_path / "out" / "corrected.json")["schema"] == "jaxpanda.corrected/1"
     assert {"corrected.json", "corrected.xml", "diagnosis.json"} == {
         p.name for p in (tmp_path / "out").iterdir()
     }

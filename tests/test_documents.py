@@ -1,10 +1,14 @@
 """The README and the documents: short enough, and every link leads somewhere."""
 
+import json
 import re
 import subprocess
 from pathlib import Path
 
+import jsonschema
 import pytest
+
+import jaxpanda
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
@@ -48,3 +52,16 @@ def test_the_checks_find_their_commands_in_the_readme(mark, starts):
     )
     assert found.stdout.startswith(starts)
     assert found.stdout.count("\n") == 1
+
+
+def test_every_public_name_is_in_the_reference():
+    text = (ROOT / "docs" / "api.md").read_text()
+    assert [
+        name for name in dir(jaxpanda) if not re.search(rf":: jaxpanda\.{name}$", text, re.MULTILINE)
+    ] == []
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("docs/schemas/*.json")), ids=lambda path: path.name)
+def test_every_schema_is_one_and_is_told_of(path):
+    jsonschema.Draft202012Validator.check_schema(json.loads(path.read_text()))
+    assert f"schemas/{path.name}" in (ROOT / "docs" / "schemas.md").read_text()

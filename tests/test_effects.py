@@ -107,7 +107,7 @@ def test_every_effect_has_as_many_columns_as_coefficients_and_all_are_finite(arm
 
 def test_every_effect_reads_back_from_its_json_and_says_its_parameters(arm, motion, channels):
     for effect in shapes(arm):
-        again = effect_from_json(effect.to_json())
+        again = effect_from_json(effect.to_json(), {type(effect).__name__: type(effect)})
         np.testing.assert_array_equal(columns(again, motion, channels), columns(effect, motion, channels))
         n = len(effect.coefficients)
         parameters = effect.parameters(np.ones(n), np.eye(n + sum(not s.pivot for s in effect.shapes)))

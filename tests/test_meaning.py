@@ -5,12 +5,12 @@ The recordings are those of `experiments/torque_meaning`: torque is MuJoCo's, no
 
 import dataclasses
 import importlib
-import json
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import result
 
 from jaxpanda import Recording
 from jaxpanda.__main__ import main
@@ -152,7 +152,7 @@ def files(trial, tmp_path):
 def test_diagnose_says_what_the_column_is_and_seeks_no_physics_in_it(files):
     folder, given = files
     assert main(["diagnose", *given, "--out", str(folder / "out")]) == 0
-    document = json.loads((folder / "out" / "diagnosis.json").read_text())
+    document = result(folder / "out" / "diagnosis.json")
     (finding,) = document["findings"]
     assert (finding["effect"], finding["family"]) == ("torque_meaning", "meaning")
     assert finding["kind"] == "gravity_removed"

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import payload_pairs as pairs
 import pytest
+from helpers import result
 from jaxpanda_kernels import inertia
 from scipy.spatial.transform import Rotation
 
@@ -59,7 +60,7 @@ def test_the_command_finds_the_body_and_writes_it_in_every_form(files, tmp_path,
     out = tmp_path / "out"
     assert main(command(files, out, "--json")) == 0
     said = json.loads(capsys.readouterr().out)
-    assert said == json.loads((out / "payload.json").read_text())
+    assert said == result(out / "payload.json")
     assert said["schema"] == "jaxpanda.payload/1"
     assert said["verdict"] == "found"
     assert said["frame"]["name"] == "flange"
@@ -137,7 +138,7 @@ def test_a_pair_without_a_body_shows_none_and_old_files_go(tmp_path):
     save(without, tmp_path / "without.csv")
     save(loaded, tmp_path / "with.csv")
     assert main(command(tmp_path, out)) == 0
-    said = json.loads((out / "payload.json").read_text())
+    said = result(out / "payload.json")
     assert said["verdict"] == "no_difference"
     assert "show no difference" in said["summary"][0]
     assert said["com"] is said["inertia"] is said["commands"] is said["mjcf"] is None

@@ -1,11 +1,11 @@
 """An arm that holds still: what is beyond friction at rest is told, what is within it is not."""
 
 import dataclasses
-import json
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import result
 from scipy.signal import lfilter
 
 from jaxpanda import Arm, Recording
@@ -81,7 +81,7 @@ def test_an_arm_at_rest_is_answered_and_its_prediction_is_the_users_model(rubbin
         str(out),
     ]
     assert main(command) == 0
-    document = json.loads((out / "diagnosis.json").read_text())
+    document = result(out / "diagnosis.json")
     assert (document["verdict"], document["findings"]) == ("consistent", [])
     assert any("no joint moves, so that none was judged" in note for note in document["notes"])
     assert (out / "corrected.xml").read_text() == rubbing.read_text()

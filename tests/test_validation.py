@@ -13,12 +13,19 @@ from numpy.testing import assert_allclose
 
 from jaxpanda import validation
 from jaxpanda.errors import InputError
+from jaxpanda.export import panda_mjcf
 from jaxpanda.friction import Friction
 from jaxpanda.mjcf import from_mjcf
 from jaxpanda.panda import panda, published
 from jaxpanda.recordings import Recording
 from jaxpanda.simulation import JointFriction, Sensors, fourier_trajectory, panda_sensors, simulate
-from jaxpanda.validation import arm_model, assert_mjx_supported, feedback_gains, validate
+from jaxpanda.validation import (
+    arm_model,
+    assert_mjx_supported,
+    assert_versions_belong_together,
+    feedback_gains,
+    validate,
+)
 
 ARM = """<mujoco model="two">
   <option timestep="0.002" integrator="{integrator}"/>
@@ -265,3 +272,19 @@ def test_the_panda_validates_in_every_engine(tmp_path):
     assert found.relative_error_percent < 0.3
     assert found.rollout_difference < 1e-8
     assert (found.mjx.rmse < 0.05).all()
+
+
+def test_an_mjx_that_is_newer_than_mujoco_is_refused_with_what_mends_it():
+    for together in (("3.17.0", "3.17.0"), ("4.0.1", "3.17.0")):
+        assert_versions_belong_together(*together)
+    with pytest.raises(InputError, match=r"mujoco-mjx 4\.1\.0 needs MuJoCo 4\.1 or newer.*'mujoco>=4\.1'"):
+        assert_versions_belong_together("4.0.1", "4.1.0")
+
+
+def test_what_is_stepped_has_a_dense_jacobian_whatever_its_file_asks_for(tmp_path):
+    """MuJoCo 4.0.0 factorises a sparse one wrongly."""
+    path = tmp_path / "sparse.xml"
+    path.write_text(panda_mjcf().replace("<option ", '<option jacobian="sparse" ', 1))
+    source = from_mjcf(path)[1]
+    assert source.model.opt.jacobian == mujoco.mjtJacobian.mjJAC_SPARSE
+    assert arm_model(source).opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect
+from ..effects import AbstractEffect, AbstractJointEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import TorqueRipple
 from ..effects.load import PayloadChange
@@ -75,7 +75,7 @@ class Least:
 
 def heat_map(problem: Problem, state: State) -> HeatMap:
     """The best shape of every effect at every joint, by evidence, and what it gains on held-out blocks."""
-    names = [c.name for c in CATALOGUE]
+    names = [c.name for c in problem.catalogue]
     groups = [*problem.library, *problem.catchalls]
     second = _best(problem, state.design, state.noise, groups)
     if not state.terms:
@@ -244,7 +244,7 @@ def least_shown(problem: Problem, state: State) -> tuple[Least, ...]:
             (one for _, one in found if one.rms_torque is not None), key=lambda one: one.rms_torque or 0.0
         )
         out.append(shown[len(shown) // 2] if shown else found[0][1])
-    order = [c.name for c in CATALOGUE]
+    order = [c.name for c in problem.catalogue]
     return tuple(
         sorted(out, key=lambda one: (order.index(one.effect), -1 if one.joint is None else one.joint))
     )

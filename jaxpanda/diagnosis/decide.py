@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import CATALOGUE
 from ..effects.drive import Armature
 from ..effects.friction import CoulombFriction, ViscousFriction
 from ..effects.load import InertialParameters
@@ -236,6 +235,7 @@ def _finding(
         summary=summary,
         terms=tuple(members),
         kind=getattr(terms[0].effect, "form", ""),
+        own_family=effect.family,
     )
 
 
@@ -266,7 +266,7 @@ def _summary(name, joints, rms, intervals, recordings, alternatives, problem, ow
     )
     if alternatives and own < 0.9:
         rival = alternatives[0][0]
-        cls = next(c for c in CATALOGUE if c.name == name)
+        cls = next(c for c in problem.catalogue if c.name == name)
         text += f" These recordings could also mean {rival.replace('_', ' ')}; {cls.reveals} would tell."
     return text
 

@@ -15,7 +15,7 @@ from .. import files, markup
 from .. import signals as signals_
 from ..arm import Arm
 from ..corrected import FILE, KIND, XML, Corrected, read
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, catalogue_with
 from ..effects.drive import Armature
 from ..errors import InputError, require_x64
 from ..export import (
@@ -177,6 +177,7 @@ def diagnose(
     reference: Sequence[str | Path | Recording] = (),
     knowledge: knowledge_.Knowledge = "identified",
     gravity: Sequence[float] | None = None,
+    effects: Sequence[type[AbstractEffect]] = (),
     progress: Say = silent,
 ) -> Diagnosis | AtRest | Misread:
     """Say which physics a simulation is missing; of an arm that holds still, what friction at rest leaves open;
@@ -188,12 +189,16 @@ def diagnose(
         reference: recordings of the same arm from when nothing was wrong; what they show is not reported.
         knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` explains the words.
         gravity: in place of the model's, in the frame of its world [m/s²].
+        effects: classes of your own that are tried beside the catalogue's; `Corrected.load`, `predict` and
+            `replay` take them too. They are not tried on an arm that holds still.
         progress: called with what is being done, and with each line of `log` as it is written.
 
     Raises:
-        InputError: a file that cannot be read, a recording that does not fit the model, or one given twice.
+        InputError: a file that cannot be read, a recording that does not fit the model, or one given twice; an
+            effect that is none, or whose name is taken.
     """
     require_x64("a diagnosis")
+    catalogue = catalogue_with(effects)
     knowledge_.check(knowledge)
     if model is None:
         own = markup.parse(panda_mjcf(), "mujoco", Path("panda.xml"))
@@ -221,7 +226,7 @@ def diagnose(
         return wrongly_read
     progress("looking for effects that make the recordings likelier; that takes most of the time")
     log = _Log(progress)
-    premises, state = settled(tuple(traces), tuple(active), knowledge, log)
+    premises, state = settled(tuple(traces), tuple(active), knowledge, log, catalogue=catalogue)
     problem = premises.problem
     progress("refining the numbers, and weighing what else it could be")
     state = polished(problem, state)
@@ -513,14 +518,21 @@ def _nearest(
     return nearest, np.sqrt(np.mean((felt @ (nearest - standard).ravel()) ** 2, 0))
 
 
-def predict(folder: str | Path, motion: str | Path | Recording) -> Float[np.ndarray, "rows dof"]:
+def predict(
+    folder: str | Path, motion: str | Path | Recording, *, effects: Sequence[type[AbstractEffect]] = ()
+) -> Float[np.ndarray, "rows dof"]:
     """Torque [N m] that the sensors would measure, for each row of a motion, from what `diagnose` saved.
 
+    Args:
+        folder: that `diagnose` wrote.
+        motion: of the arm.
+        effects: classes of your own that `diagnose` was given.
+
     Raises:
-        InputError: no saved diagnosis in the folder, or a motion of another arm.
+        InputError: no saved diagnosis in the folder, a motion of another arm, or an effect of an unknown class.
     """
     require_x64("a prediction")
-    corrected, noise = read(folder)
+    corrected, noise = read(folder, effects)
     recording = motion if isinstance(motion, Recording) else load(motion)
     recording.require_dof(corrected.arm.dof)
     trace = prepare(recording, corrected.arm, whole=True, noise=noise)

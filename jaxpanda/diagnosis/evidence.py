@@ -69,6 +69,9 @@ class OnDemand(Sequence):
             raise IndexError(index)
         return self.make(int(index))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return list, (list(self),)
+
 
 class Design:
     """What is in the model already: whitened columns for each joint, and their prior."""

@@ -61,10 +61,13 @@ class Finding:
     kind: str = ""
     """Which form of the effect; "" where it has one."""
 
+    own_family: str = "unknown"
+    """Of an effect that `FAMILIES` does not have."""
+
     @property
     def family(self) -> str:
         """Which part of the arm, or of its recording, the effect belongs to: a word of `FAMILIES`' values."""
-        return FAMILIES.get(self.effect, "unknown")
+        return FAMILIES.get(self.effect, self.own_family)
 
     def to_json(self) -> dict[str, Any]:
         return {

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import CATALOGUE, AbstractArmEffect, AbstractEffect, AbstractJointEffect, joint_columns
+from ..effects import AbstractArmEffect, AbstractEffect, AbstractJointEffect, joint_columns
 from .host import parallel
 from .traces import Trace
 
@@ -53,11 +53,11 @@ def form_of(effect: AbstractEffect) -> tuple[str, str]:
     return type(effect).__name__, str(getattr(effect, "form", ""))
 
 
-def build(traces: Sequence[Trace]) -> list[Candidates]:
+def build(traces: Sequence[Trace], catalogue: Sequence[type[AbstractEffect]]) -> list[Candidates]:
     """The catalogue's grids on these recordings."""
     arm = traces[0].motion.arm
     groups: dict[tuple, list[AbstractEffect]] = defaultdict(list)
-    for effect_class in CATALOGUE:
+    for effect_class in catalogue:
         for effect in effect_class.grid(arm):
             groups[form_of(effect)].append(effect)
     for trace in traces:  # made once, before there are threads

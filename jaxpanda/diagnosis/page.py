@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from .. import summaries
 from ..arm import Arm
-from ..effects import CATALOGUE, AbstractEffect
+from ..effects import AbstractEffect
 from ..report import Figure, Listing, Section, Table, number
 from .decide import coefficients
 from .diagnosis import NEXT_MOTION, Diagnosis
@@ -122,7 +122,7 @@ def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -
     felt = ["rms", *(number(float(v), 3) for v in one.rms_torque)]
     tables.append(Table(["", *names], [felt], f"Torque that it explains [{found.problem.arm.unit('N·m')}]"))
     if one.alternatives:
-        reveals = {c.name: c.reveals for c in CATALOGUE}
+        reveals = {c.name: c.reveals for c in found.problem.catalogue}
         rows = [[_plain(name), f"{p:.2f}", reveals.get(name, "")] for name, p in one.alternatives]
         tables.append(Table(["what else it could be", "probability", "what would show that"], rows))
     return Section(

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..effects import CATALOGUE, AbstractEffect
 from . import knowledge as knowledge_
 from .noise import Saturation
 from .problem import Problem, Term, posed
@@ -59,6 +60,7 @@ def pose(
     background: Sequence[Term] = (),
     saturated: Saturation | None = None,
     scale: float = 1.0,
+    catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE,
 ) -> Premises:
     """The problem of these recordings under what is known; `scale` multiplies the uncertainty of the inertias."""
     arm = traces[0].motion.arm
@@ -67,7 +69,7 @@ def pose(
     std = empty.noise(()).std
     spread = scale * knowledge_.inertial_spread(arm, knowledge, std)
     columns, numbers = knowledge_.nuisance(traces, spread, knowledge, std, scale)
-    problem = posed(traces, active, columns, background, empty.saturation, numbers)
+    problem = posed(traces, active, columns, background, empty.saturation, numbers, catalogue)
     return Premises(problem, spread, knowledge, scale, problem.background)
 
 
@@ -77,6 +79,7 @@ def settled(
     knowledge: knowledge_.Knowledge,
     log: list[str],
     scale: float = 1.0,
+    catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE,
 ) -> tuple[Premises, State]:
     """Effects found under premises that the recordings do not contradict."""
     background: tuple[Term, ...] = ()
@@ -84,11 +87,12 @@ def settled(
     healthy = tuple(t for t, on in zip(traces, active, strict=True) if not on)
     if healthy:
         log.append("healthy recordings alone")
-        premises, state = settled(healthy, (True,) * len(healthy), knowledge, log, scale)
+        premises, state = settled(healthy, (True,) * len(healthy), knowledge, log, scale, catalogue)
         knowledge, scale, notes = premises.knowledge, premises.scale, premises.notes
         background = tuple(t.law for t in state.terms if not t.effect.bound_to_recording)
         log.append("suspect recordings beside them")
-    premises = dataclasses.replace(pose(traces, active, knowledge, background, scale=scale), notes=notes)
+    premises = pose(traces, active, knowledge, background, scale=scale, catalogue=catalogue)
+    premises = dataclasses.replace(premises, notes=notes)
     state = search(premises.problem, log)
     while (wider := _wider(premises, state)) is not None:
         log.append(f"the model's numbers as {wider.knowledge!r}, {wider.scale:g} times: searched again")
@@ -114,7 +118,9 @@ def _wider(premises: Premises, state: State) -> Premises | None:
     problem = premises.problem
     best, likeliest = None, state.score + _price(premises)
     for k, x, price in RUNGS[at[0] + 1 :] if at else ():
-        other = pose(problem.traces, problem.active, k, premises.background, problem.saturation, x)
+        other = pose(
+            problem.traces, problem.active, k, premises.background, problem.saturation, x, problem.catalogue
+        )
         value = _needed(other.problem, state).score + price
         if value > likeliest:
             best, likeliest = other, value

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from .. import signals as signals_
 from ..arm import Arm
-from ..effects import AbstractEffect, AbstractJointEffect
+from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect
 from ..errors import InputError
 from . import catchall
 from .discrepancy import of_law, unresolved, unresolved_known
@@ -90,10 +90,19 @@ class Problem:
     """How many columns of the nuisance, the first ones, are numbers of the user's model."""
     saturated: Saturation | None = dataclasses.field(default=None, repr=False, compare=False)
     """That of the same recordings, where a problem posed otherwise has made it already."""
+    catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE
+    """Effects that are tried."""
     _lock: threading.Lock = dataclasses.field(
         default_factory=threading.Lock, init=False, repr=False, compare=False
     )
     """Of what `columns` keeps."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickle: the fields, without what can be made again."""
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.init}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _lock=threading.Lock())
 
     @property
     def arm(self) -> Arm:
@@ -113,7 +122,7 @@ class Problem:
     def library(self) -> list[Candidates]:
         """The catalogue on these recordings; zero in those of reference."""
         out = []
-        for c in build(self.traces):
+        for c in build(self.traces, self.catalogue):
             columns = tuple(
                 x if on else np.zeros_like(x) for x, on in zip(c.columns, self.active, strict=True)
             )
@@ -498,6 +507,7 @@ def posed(
     background: Sequence[Term] = (),
     saturated: Saturation | None = None,
     numbers: int | None = None,
+    catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE,
 ) -> Problem:
     """A problem whose background acts in all recordings: its columns, by their deviations, end the nuisance."""
     everywhere = Problem(traces, (True,) * len(traces), tuple(nuisance))
@@ -505,4 +515,4 @@ def posed(
     wide = [
         np.concatenate([n, *(t.columns[r] * t.deviation for t in terms)], 2) for r, n in enumerate(nuisance)
     ]
-    return Problem(traces, active, tuple(wide), terms, numbers, saturated)
+    return Problem(traces, active, tuple(wide), terms, numbers, saturated, catalogue)

@@ -1,5 +1,9 @@
 """The catalogue of physics beyond rigid bodies: one class an effect, one file a family."""
 
+import inspect
+from collections.abc import Sequence
+
+from ..errors import InputError
 from . import contact, drive, friction, load, memory, sensing, stribeck, unknown
 from .effect import AbstractArmEffect as AbstractArmEffect
 from .effect import AbstractEffect as AbstractEffect
@@ -19,7 +23,7 @@ from .motion import masses as masses
 from .motion import slopes as slopes
 from .motion import smooth_torque as smooth_torque
 
-CATALOGUE = (
+CATALOGUE: tuple[type[AbstractEffect], ...] = (
     *friction.EFFECTS,
     *stribeck.EFFECTS,
     *memory.EFFECTS,
@@ -29,3 +33,30 @@ CATALOGUE = (
     *contact.EFFECTS,
     *unknown.EFFECTS,
 )
+
+
+def catalogue_with(effects: Sequence[type[AbstractEffect]]) -> tuple[type[AbstractEffect], ...]:
+    """The catalogue and a user's own effects after it.
+
+    Raises:
+        InputError: one that is no class of an effect, lacks a method, or goes by a name that is taken.
+    """
+    out = CATALOGUE
+    for effect in effects:
+        if not (isinstance(effect, type) and issubclass(effect, AbstractEffect)):
+            raise InputError(f"effects: {effect!r} is no subclass of jaxpanda.effects.AbstractEffect")
+        if inspect.isabstract(effect):
+            lacking = ", ".join(sorted(effect.__abstractmethods__))
+            raise InputError(f"effects: {effect.__name__} lacks {lacking}")
+        if not isinstance(getattr(effect, "name", None), str):
+            raise InputError(
+                f"effects: {effect.__name__} lacks a name, such as name: ClassVar[str] = 'gear_slip'"
+            )
+        taken = next((c for c in out if effect.name == c.name or effect.__name__ == c.__name__), None)
+        if taken is not None:
+            raise InputError(
+                f"effects: {effect.__name__} ({effect.name!r}) needs a class name and a name of its own: there is"
+                f" {taken.__name__} ({taken.name!r}) already"
+            )
+        out = (*out, effect)
+    return out
