@@ -214,9 +214,11 @@ def _needs(reading: "_Reading") -> float:
     if not reading.kind:
         return 0.0
     altered = len(_altered(reading))
+    common = altered == len(reading.factors)
+    usual = common and abs(float(reading.factors[0])) in _UNITS.values()
     choices = {
         "gravity_removed": 1,
-        "unit": 1 if altered == len(reading.factors) else 2 * altered,
+        "unit": 1 if usual else altered if common else 2 * altered,
         "mounting": 3,
     }
     return max(_NEEDS, _EACH * choices.get(reading.kind, altered))
