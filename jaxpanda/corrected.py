@@ -1,6 +1,7 @@
 """The corrected model: the user's arm, what is now known better of it, and the effects that were missing."""
 
 import dataclasses
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -253,7 +254,7 @@ def read(
         raise InputError(f"{path}: {error}") from None
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
-            f"{path}: is not as `diagnose` writes it ({type(error).__name__}: {' '.join(str(error).split())});"
+            f"{path}: is not as `diagnose` writes it ({type(error).__name__}: {textwrap.shorten(str(error), 300)});"
             " diagnose again"
         ) from None
     return found, noise

@@ -179,6 +179,8 @@ def velocity_scale(recording: Recording) -> float | None:
     qd = recording.qd[half:-half]
     if not (np.any(slope) and np.any(qd)):
         return None
-    k = np.sum(slope * qd) / np.sum(slope**2)
+    sizes = float(np.abs(slope).max()), float(np.abs(qd).max())
+    slope, qd = slope / sizes[0], qd / sizes[1]  # squares of what some files hold overflow
+    k = np.sum(slope * qd) / np.sum(slope**2) * (sizes[1] / sizes[0])
     correlation = np.sum(slope * qd) / np.sqrt(np.sum(slope**2) * np.sum(qd**2))
     return float(k) if abs(correlation) > 0.8 else None
