@@ -253,9 +253,9 @@ def read(
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (LookupError, TypeError, ValueError, AttributeError) as error:
+        said = textwrap.shorten(str(error), 300)
         raise InputError(
-            f"{path}: is not as `diagnose` writes it ({type(error).__name__}: {textwrap.shorten(str(error), 300)});"
-            " diagnose again"
+            f"{path}: is not as `diagnose` writes it ({type(error).__name__}: {said}); diagnose again"
         ) from None
     return found, noise
 
