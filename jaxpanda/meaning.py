@@ -218,6 +218,7 @@ def _needs(reading: "_Reading") -> float:
     usual = common and abs(float(reading.factors[0])) in _UNITS.values()
     choices = {
         "gravity_removed": 1,
+        "sign": 1 if common else altered,
         "unit": 1 if usual else altered if common else 2 * altered,
         "mounting": 3,
     }
