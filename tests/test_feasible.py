@@ -272,7 +272,7 @@ def test_inertia_and_total_mass_may_be_absent_from_a_table(tmp_path):
         (GOOD + "total_mass,7,8\n", "total_mass"),
         (GOOD + "m3,0,1\n", "no row for m2"),
         ("name;lower;upper\n", "no columns name,lower,upper"),
-        ("", "no columns"),
+        ("", "empty"),
     ],
 )
 def test_a_malformed_table_of_bounds_is_refused_by_row_and_column(tmp_path, text, complaint):
