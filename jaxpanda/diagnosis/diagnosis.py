@@ -14,7 +14,7 @@ from jaxtyping import Float
 from .. import files, markup
 from .. import signals as signals_
 from ..arm import Arm
-from ..corrected import FILE, KIND, XML, Corrected, read
+from ..corrected import KIND, Corrected, read
 from ..effects import AbstractEffect, catalogue_with
 from ..effects.drive import Armature
 from ..errors import InputError, require_x64
@@ -23,7 +23,6 @@ from ..export import (
     edit_mjcf,
     missing_assets,
     panda_mjcf,
-    write_document,
     write_parameters,
 )
 from ..feasible.nearest import are_buildable, nearest_buildable
@@ -31,6 +30,7 @@ from ..mjcf import MjcfSource, from_document, from_mjcf, with_gravity
 from ..recordings import Recording, distinct, load
 from ..session import Say, silent
 from . import knowledge as knowledge_
+from . import saved
 from .calibration import calibrated
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
@@ -159,11 +159,8 @@ class Diagnosis:
         Raises:
             InputError: a file of such a name stands there that no earlier diagnosis left; nothing is written.
         """
-        noise = [float(v) for v in self.fit.noise_floor]
         with files.output_folder(folder, KIND) as scratch:
-            write_document(self.written, scratch / XML)
-            files.write_json(scratch / KIND.names[0], self.to_json())
-            files.write_json(scratch / FILE, {**self.corrected.to_json(), "torque_noise": noise})
+            saved.write(self, scratch)
             if self.next_motion is not None:
                 self.next_motion.save(scratch / NEXT_MOTION)
         return missing_assets(self.written, Path(folder))

@@ -8,13 +8,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .. import files, markup, summaries
-from ..corrected import FILE, KIND, XML, Corrected
-from ..export import missing_assets, write_document
+from .. import markup, summaries
+from ..corrected import Corrected
+from ..export import missing_assets
 from ..meaning import Meaning, meaning
 from ..mjcf import MjcfSource
 from ..recordings import Recording
 from ..report import Section
+from . import saved
 from .finding import Finding, Fit
 from .knowledge import Knowledge
 from .traces import Trace
@@ -83,11 +84,7 @@ class Misread:
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
         """Write diagnosis.json, corrected.xml and corrected.json, of the user's model as it is."""
-        noise = [float(v) for v in self.fit.noise_floor]
-        with files.output_folder(folder, KIND) as scratch:
-            write_document(self.written, scratch / XML)
-            files.write_json(scratch / KIND.names[0], self.to_json())
-            files.write_json(scratch / FILE, {**self.corrected.to_json(), "torque_noise": noise})
+        saved.write(self, folder)
         return missing_assets(self.written, Path(folder))
 
 

@@ -30,13 +30,14 @@ import numpy as np
 import scipy.special
 from jaxtyping import Bool, Float
 
-from .. import files, markup, summaries
+from .. import markup, summaries
 from ..arm import Arm
-from ..corrected import FILE, KIND, XML, Corrected
+from ..corrected import Corrected
 from ..effects import Motion
-from ..export import write_document
+from ..export import missing_assets
 from ..mjcf import MjcfSource
 from ..report import Figure, Section, Table, number
+from . import saved
 from .finding import Finding, Fit
 from .knowledge import Knowledge, inertial_spread
 from .traces import Trace
@@ -182,13 +183,7 @@ class AtRest:
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
         """Write diagnosis.json, corrected.xml and corrected.json."""
-        from ..export import missing_assets
-
-        noise = [float(v) for v in self.fit.noise_floor]
-        with files.output_folder(folder, KIND) as scratch:
-            write_document(self.written, scratch / XML)
-            files.write_json(scratch / KIND.names[0], self.to_json())
-            files.write_json(scratch / FILE, {**self.corrected.to_json(), "torque_noise": noise})
+        saved.write(self, folder)
         return missing_assets(self.written, Path(folder))
 
 

@@ -1,0 +1,35 @@
+"""The files that every diagnosis leaves, whatever it found."""
+
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from .. import files, markup
+from ..corrected import FILE, KIND, XML, Corrected
+from ..export import write_document
+from .finding import Fit
+
+
+@runtime_checkable
+class Answer(Protocol):
+    """What a diagnosis has in common with that of an arm at rest, or of torque that is none."""
+
+    @property
+    def written(self) -> markup.Document: ...
+    @property
+    def corrected(self) -> Corrected: ...
+    @property
+    def fit(self) -> Fit: ...
+    def to_json(self) -> dict[str, Any]: ...
+
+
+def write(found: Answer, folder: str | Path) -> None:
+    """diagnosis.json, corrected.xml with what it includes, and corrected.json, as one set.
+
+    Raises:
+        InputError: a file of such a name stands there that no earlier diagnosis left; nothing is written.
+    """
+    noise = [float(v) for v in found.fit.noise_floor]
+    with files.output_folder(folder, KIND) as scratch:
+        write_document(found.written, scratch / XML)
+        files.write_json(scratch / KIND.names[0], found.to_json())
+        files.write_json(scratch / FILE, {**found.corrected.to_json(), "torque_noise": noise})
