@@ -7,32 +7,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-FAMILIES = {
-    **dict.fromkeys(
-        (
-            "viscous_friction",
-            "coulomb_friction",
-            "asymmetric_friction",
-            "stribeck_friction",
-            "load_dependent_friction",
-            "friction_drift",
-            "presliding_hysteresis",
-            "power_law_friction",
-        ),
-        "friction",
-    ),
-    **dict.fromkeys(("torque_ripple", "backlash", "joint_elasticity", "armature"), "drive"),
-    **dict.fromkeys(
-        ("inertial_parameters", "payload", "payload_change", "gravity_direction", "joint_spring"), "load"
-    ),
-    **dict.fromkeys(
-        ("torque_offset", "torque_gain", "torque_drift", "torque_crosstalk", "encoder_offset"), "sensor"
-    ),
-    "time_delay": "clock",
-    "external_contact": "contact",
-    "torque_meaning": "meaning",
-    "unknown": "unknown",
-}
+from ..effects import CATALOGUE
+
+FAMILIES = {**{effect.name: effect.family for effect in CATALOGUE}, "torque_meaning": "meaning"}
 """The family of each effect that a finding may have."""
 
 

@@ -28,6 +28,7 @@ class ExternalContact(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "external_contact"
+    family: ClassVar[str] = "contact"
     prior: ClassVar[float] = -45.0
     shapes: ClassVar[tuple[Shape, ...]] = (
         Shape("start", "s", -np.inf, np.inf, False),

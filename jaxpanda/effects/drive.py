@@ -26,6 +26,7 @@ class Armature(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "armature"
+    family: ClassVar[str] = "drive"
     reveals: ClassVar[str] = "high accelerations in several poses of the joints beyond"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "joint_spring")
 
@@ -75,6 +76,7 @@ class JointSpring(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "joint_spring"
+    family: ClassVar[str] = "load"
     prior: ClassVar[float] = -28.0
     reveals: ClassVar[str] = "the joint's full range at rest, in different poses of the arm"
     confounded_with: ClassVar[tuple[str, ...]] = ("torque_offset", "inertial_parameters", "encoder_offset")
@@ -187,6 +189,7 @@ class TorqueRipple(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "torque_ripple"
+    family: ClassVar[str] = "drive"
     repeats: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("order", "1/rad", 2.5, 600.0),)
     reveals: ClassVar[str] = "a sweep of speeds: the frequency moves with it, the order stays"
@@ -240,6 +243,7 @@ class JointElasticity(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "joint_elasticity"
+    family: ClassVar[str] = "drive"
     prior: ClassVar[float] = -40.0
     discrepancy: ClassVar[float] = 0.15
     varies_with: ClassVar[tuple[str, ...]] = ("moments",)
@@ -358,6 +362,7 @@ class Backlash(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "backlash"
+    family: ClassVar[str] = "drive"
     discrepancy: ClassVar[float] = 0.3
     varies_with: ClassVar[tuple[str, ...]] = ("moments",)
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"

@@ -75,7 +75,7 @@ class AbstractEffect(eqx.Module):
     name: ClassVar[str]
     """Name in the interface's table of effects."""
     family: ClassVar[str] = "unknown"
-    """Of an effect outside the catalogue: friction, drive, load, sensor, clock, contact or unknown."""
+    """Part of the arm, or of its recording: friction, drive, load, sensor, clock, contact or unknown."""
     shapes: ClassVar[tuple[Shape, ...]] = ()
     reveals: ClassVar[str] = ""
     """The motion that shows the effect, and tells it from what it is confounded with."""

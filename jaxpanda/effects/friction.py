@@ -41,6 +41,7 @@ class ViscousFriction(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "viscous_friction"
+    family: ClassVar[str] = "friction"
     reveals: ClassVar[str] = "runs at four or more constant speeds, in both directions"
     prior: ClassVar[float] = COMMON
     confounded_with: ClassVar[tuple[str, ...]] = ("coulomb_friction", "time_delay")
@@ -76,6 +77,7 @@ class CoulombFriction(AbstractDryFriction):
     r"""Friction of constant magnitude, $\tau_j = F_c \tanh(\dot q_j / v_0)$."""
 
     name: ClassVar[str] = "coulomb_friction"
+    family: ClassVar[str] = "friction"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("v0", "rad/s", 1e-3, 0.06),)
     reveals: ClassVar[str] = "reversals, with dwells between them"
     prior: ClassVar[float] = COMMON
@@ -125,6 +127,7 @@ class PowerLawFriction(AbstractDryFriction):
     """
 
     name: ClassVar[str] = "power_law_friction"
+    family: ClassVar[str] = "friction"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("exponent", "1", 0.35, 3.0),)
     reveals: ClassVar[str] = ViscousFriction.reveals
     prior: ClassVar[float] = -28.0
@@ -168,6 +171,7 @@ class AsymmetricFriction(AbstractDryFriction):
     """
 
     name: ClassVar[str] = "asymmetric_friction"
+    family: ClassVar[str] = "friction"
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
     reveals: ClassVar[str] = "rests of 0.3 s and more, and motion in both directions"
     prior: ClassVar[float] = -28.0
@@ -276,6 +280,7 @@ class LoadDependentFriction(AbstractDryFriction):
     """
 
     name: ClassVar[str] = "load_dependent_friction"
+    family: ClassVar[str] = "friction"
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH, Shape("exponent", "1", 0.6, 1.6))
     reveals: ClassVar[str] = "the same speed in loaded and unloaded poses; with and without payload"
     prior: ClassVar[float] = -28.0
@@ -363,6 +368,7 @@ class FrictionDrift(AbstractDryFriction):
     """
 
     name: ClassVar[str] = "friction_drift"
+    family: ClassVar[str] = "friction"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0), _WIDTH)
     reveals: ClassVar[str] = "the same motion cold and warm"
     prior: ClassVar[float] = -28.0

@@ -72,6 +72,7 @@ class InertialParameters(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "inertial_parameters"
+    family: ClassVar[str] = "load"
     reveals: ClassVar[str] = "an identification motion; a reference recording from before"
     confounded_with: ClassVar[tuple[str, ...]] = ("payload", "joint_spring", "torque_gain", "encoder_offset")
 
@@ -124,6 +125,7 @@ class Payload(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "payload"
+    family: ClassVar[str] = "load"
     reveals: ClassVar[str] = "a recording without the load, of the same motion"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "torque_gain")
 
@@ -168,6 +170,7 @@ class PayloadChange(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "payload_change"
+    family: ClassVar[str] = "load"
     prior: ClassVar[float] = -28.0
     reveals: ClassVar[str] = "the same poses before and after"
     confounded_with: ClassVar[tuple[str, ...]] = ("external_contact", "torque_drift")
@@ -261,6 +264,7 @@ class GravityDirection(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "gravity_direction"
+    family: ClassVar[str] = "load"
     reveals: ClassVar[str] = "the first joint turned over 180 degrees"
     confounded_with: ClassVar[tuple[str, ...]] = ("joint_spring", "torque_offset", "inertial_parameters")
 

@@ -20,6 +20,7 @@ class TorqueOffset(AbstractInstantEffect):
     r"""Constant bias of a torque sensor, $\tau_j = b$."""
 
     name: ClassVar[str] = "torque_offset"
+    family: ClassVar[str] = "sensor"
     reveals: ClassVar[str] = "rests, and poses on both sides of the joint's zero of gravity"
     confounded_with: ClassVar[tuple[str, ...]] = (
         "asymmetric_friction",
@@ -60,6 +61,7 @@ class TorqueGain(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "torque_gain"
+    family: ClassVar[str] = "sensor"
     reveals: ClassVar[str] = "a known load at the flange"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "payload", "load_dependent_friction")
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
@@ -98,6 +100,7 @@ class TorqueDrift(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "torque_drift"
+    family: ClassVar[str] = "sensor"
     prior: ClassVar[float] = -28.0
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0),)
     reveals: ClassVar[str] = "the same poses early and late"
@@ -180,6 +183,7 @@ class TorqueCrosstalk(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "torque_crosstalk"
+    family: ClassVar[str] = "sensor"
     reveals: ClassVar[str] = "poses in which the two joints' torques differ"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction")
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
@@ -218,6 +222,7 @@ class EncoderOffset(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "encoder_offset"
+    family: ClassVar[str] = "sensor"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "rad", -0.6, 0.6, False, pivot=True),)
     reveals: ClassVar[str] = "the joint at rest over its range; with and without payload"
     confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction", "joint_spring")
@@ -267,6 +272,7 @@ class TimeDelay(AbstractArmEffect):
     """
 
     name: ClassVar[str] = "time_delay"
+    family: ClassVar[str] = "clock"
     prior: ClassVar[float] = -45.0
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "s", 1e-4, 0.2, pivot=True),)
     reveals: ClassVar[str] = "fast reversals"

@@ -36,6 +36,7 @@ class StribeckFriction(AbstractDryFriction):
     """
 
     name: ClassVar[str] = "stribeck_friction"
+    family: ClassVar[str] = "friction"
     shapes: ClassVar[tuple[Shape, ...]] = (
         _VELOCITY,
         Shape("v0", "rad/s", 1e-3, 0.05),
@@ -116,6 +117,7 @@ class StribeckBristles(AbstractMemoryEffect):
     """
 
     name: ClassVar[str] = StribeckFriction.name
+    family: ClassVar[str] = "friction"
     shapes: ClassVar[tuple[Shape, ...]] = (_VELOCITY, Shape("breakaway_distance", "rad", 1e-4, 0.05))
     reveals: ClassVar[str] = StribeckFriction.reveals
     prior: ClassVar[float] = StribeckFriction.prior
