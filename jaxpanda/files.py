@@ -297,14 +297,9 @@ def _require_replaceable(path: Path) -> os.stat_result | None:
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be written ({error}); choose another --out") from None
     if not stat.S_ISREG(found.st_mode):
-        kinds = {
-            stat.S_IFDIR: "a folder",
-            stat.S_IFLNK: "a link",
-            stat.S_IFIFO: "a pipe",
-            stat.S_IFCHR: "a device",
-        }
-        kind = kinds.get(stat.S_IFMT(found.st_mode), "a special file")
-        raise InputError(f"{path}: is {kind}, which no result replaces; choose another --out")
+        raise InputError(
+            f"{path}: is {inputs.kind_of(found)}, which no result replaces; choose another --out"
+        )
     if inputs.is_input(found):
         raise InputError(
             f"{path}: is an input of this command, which its result would replace; choose another --out"

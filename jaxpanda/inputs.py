@@ -64,6 +64,17 @@ def is_input(found: os.stat_result) -> bool:
     return _read is not None and (found.st_dev, found.st_ino) in _read
 
 
+def kind_of(found: os.stat_result) -> str:
+    """What a file is that is no regular one, in words."""
+    kinds = {
+        stat.S_IFDIR: "a folder",
+        stat.S_IFLNK: "a link",
+        stat.S_IFIFO: "a pipe",
+        stat.S_IFCHR: "a device",
+    }
+    return kinds.get(stat.S_IFMT(found.st_mode), "a special file")
+
+
 def require_regular(path: str | Path, most: int = BYTES, where: str = "") -> None:
     """Refuse a file that others will open for us unless it is a regular one of no more than `most` bytes.
 
@@ -133,9 +144,7 @@ def _opened(path: Path, most: int, where: str) -> int:
     found = os.fstat(handle)
     try:
         if not stat.S_ISREG(found.st_mode):
-            kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device"}
-            kind = kinds.get(stat.S_IFMT(found.st_mode), "a special file")
-            raise InputError(f"{where} cannot be read (it is {kind}); a regular file is needed")
+            raise InputError(f"{where} cannot be read (it is {kind_of(found)}); a regular file is needed")
         if found.st_size > most:
             _too_large(where, most)
     except InputError:

@@ -121,8 +121,7 @@ class Trace:
     def torque_step(self) -> Float[np.ndarray, " dof"]:
         """What measured torque is written in, at most: the least difference between two rows [N m]."""
         assert self.signals.tau is not None
-        steps = np.abs(np.diff(self.signals.tau, axis=0))
-        return np.min(np.where(steps > 0, steps, np.inf), axis=0, initial=1e9)
+        return np.minimum(_least_step(self.signals.tau), 1e9)
 
     @functools.cached_property
     def shaken(self) -> Float[np.ndarray, "time dof bands"]:
@@ -183,7 +182,7 @@ def prepare(
     if noise is None and rough.tau is not None:
         noise = signals_.white_noise(rough.tau)
     if whole:
-        cutoff_q = _clearest_cutoff(position, _steps(recording.q), noise, arm, rate)
+        cutoff_q = _clearest_cutoff(position, _least_step(recording.q), noise, arm, rate)
     else:
         cutoff_q = position_cutoff(position, noise, arm, rate)
     q, qd, qdd = _derivatives(position, cutoff_q, rate)
@@ -376,7 +375,7 @@ def _clearest_cutoff(
 
     f, power = spectrum(q)
     smooth = signals_.zero_phase(q, _SMOOTH, rate)
-    written = np.maximum(step, 1e-12)
+    written = np.maximum(np.where(np.isfinite(step), step, 0.0), 1e-12)
     _, rounding = spectrum(q[0] + np.round((smooth - q[0]) / written) * written - smooth)
     twice = ((2 * rate * np.sin(np.pi * f / rate)) ** 4)[:, None]
     levels = power[1:] / twice[1:]
@@ -391,11 +390,10 @@ def _clearest_cutoff(
     return float(np.clip(best, min(_LEAST_WHOLE, 0.25 * rate), 0.25 * rate))
 
 
-def _steps(recorded: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
-    """What q is written in [rad]: the least difference between two rows; 0 of a joint that stands."""
-    steps = np.abs(np.diff(recorded, axis=0))
-    least = np.min(np.where(steps > 0, steps, np.inf), axis=0, initial=np.inf)
-    return np.where(np.isfinite(least), least, 0.0)
+def _least_step(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
+    """The least difference between two rows, which is what they are written in; infinite where all are alike."""
+    steps = np.abs(np.diff(x, axis=0))
+    return np.min(np.where(steps > 0, steps, np.inf), axis=0, initial=np.inf)
 
 
 def _position_noise(q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof"]:

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from scipy.signal.windows import hann
 
 from ..signals import Signals, white_noise
+from .calibration import SUREST
 from .finding import Finding, joined
 from .problem import Problem
 from .state import State, mean_squares
@@ -109,7 +110,7 @@ def stuck(problem: Problem, std: Float[np.ndarray, " dof"]) -> Finding | None:
         joints=joints,
         recordings=(trace.name,),
         intervals=when,
-        confidence=0.995,
+        confidence=SUREST,
         alternatives=(),
         equation="tau = constant",
         parameters=(),

@@ -31,7 +31,7 @@ from jaxpanda_kernels import Chain, regressor
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from ..friction import LINEAR
+from ..friction import LINEAR, columns
 from ..parameters import Base
 from ..simulation import FourierTrajectory
 from .limits import Limits
@@ -131,9 +131,9 @@ def gram(Y: Float[Array, "time dof base"], F: Float[Array, "time dof own"], weig
 
 def friction_columns(qd: Array, width: float) -> Float[Array, "time dof own"]:
     """Of `FRICTION`, dry friction turning over `width` [rad/s]; at once where it is 0."""
-    sign = jnp.tanh(qd / width) if width else jnp.sign(qd)
-    parts = {"viscous": qd, "coulomb": sign, "offset": jnp.ones_like(qd)}
-    return jnp.stack([parts[name] for name in LINEAR[FRICTION]], -1)
+    at_once = columns(FRICTION, qd)
+    dry = LINEAR[FRICTION].index("coulomb")
+    return at_once.at[..., dry].set(jnp.tanh(qd / width)) if width else at_once
 
 
 class Problem(eqx.Module):

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from ..arm import Arm
 from ..errors import InputError
+from ..files import finite
 from ..mjcf import MjcfSource
 from ..panda import panda
 
@@ -63,9 +64,7 @@ class Limits:
 
     def to_json(self) -> dict[str, Any]:
         names = ("lower", "upper", "velocity", "acceleration", "jerk", "torque")
-        numbers = {
-            name: [float(v) if np.isfinite(v) else None for v in getattr(self, name)] for name in names
-        }
+        numbers = {name: [finite(v) for v in getattr(self, name)] for name in names}
         return {**numbers, "sources": dict(self.sources)}
 
 
