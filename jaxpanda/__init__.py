@@ -72,9 +72,9 @@ _HOME = {
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from importlib import metadata
+        from .versions import version
 
-        return metadata.version("jaxpanda")
+        return version("jaxpanda")
     if name not in _HOME:
         raise AttributeError(f"module 'jaxpanda' has no attribute {name!r}; it has {', '.join(_HOME)}")
     value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)

@@ -5,7 +5,6 @@ import platform
 import sys
 import time
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +37,7 @@ from .simulation import (
     simulate,
 )
 from .validation import Validation, arm_model, validate
+from .versions import version
 
 MODEL = "panda.xml"
 REPORT = "report.html"
@@ -212,7 +212,7 @@ def _against_truth(found: Identification, standard: Float[np.ndarray, "dof 10"] 
 
 def _provenance(recordings: Sequence[Recording], starts: int, seed: int) -> Section:
     packages = ("jaxpanda", "jax", "mujoco", "mujoco-mjx", "numpy", "scipy")
-    versions = ", ".join(f"{name} {metadata.version(name)}" for name in packages)
+    versions = ", ".join(f"{name} {version(name)}" for name in packages)
     return Section(
         "Provenance",
         [

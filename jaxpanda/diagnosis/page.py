@@ -3,7 +3,6 @@
 import difflib
 import platform
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from .. import summaries
 from ..arm import Arm
 from ..effects import AbstractEffect
 from ..report import Figure, Listing, Section, Table, number
+from ..versions import version
 from .decide import coefficients
 from .diagnosis import NEXT_MOTION, Diagnosis
 from .finding import Finding
@@ -655,7 +655,7 @@ def _method(found: Diagnosis, names: Sequence[str]) -> Section:
         rows = [[one["name"], one["role"], one["sha256"]] for one in found.sources]
         tables.append(Table(["file", "role", "sha256"], rows, "What went in"))
     packages = ("jaxpanda", "jax", "mujoco", "numpy", "scipy")
-    versions = ", ".join(f"{name} {metadata.version(name)}" for name in packages)
+    versions = ", ".join(f"{name} {version(name)}" for name in packages)
     sentences.append(f"Python {platform.python_version()} on {platform.system()}; {versions}.")
     log = Listing(
         [("", line) for line in found.log], f"What the search tried, {len(found.log)} lines", folded=True
