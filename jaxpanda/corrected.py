@@ -48,6 +48,9 @@ class Corrected(eqx.Module):
     frictionloss_change: Float[Array, " dof"]
     effects: tuple[AbstractEffect, ...]
     coefficients: tuple[Float[Array, " _n"], ...]
+    turning: float | None = eqx.field(default=None, static=True)
+    """Velocity over which a prediction lets the model's Coulomb friction turn [rad/s], as it did in the
+    recordings; None: as MuJoCo's constraint does."""
 
     @property
     def native(self) -> Arm:
@@ -202,6 +205,7 @@ class Corrected(eqx.Module):
             "change": np.asarray(self.change).tolist(),
             "damping_change": np.asarray(self.damping_change).tolist(),
             "frictionloss_change": np.asarray(self.frictionloss_change).tolist(),
+            "turning": self.turning,
             "effects": [
                 {**effect.to_json(), "coefficients": np.asarray(c).tolist()}
                 for effect, c in zip(self.effects, self.coefficients, strict=True)
@@ -231,6 +235,7 @@ class Corrected(eqx.Module):
             jnp.asarray(document["frictionloss_change"]),
             tuple(found),
             tuple(jnp.asarray(e["coefficients"], float) for e in document["effects"]),
+            None if document.get("turning") is None else float(document["turning"]),
         )
 
 

@@ -152,6 +152,13 @@ def zero_phase(x: Float[np.ndarray, "time ..."], cutoff: float, rate: float) -> 
     return scipy.signal.sosfiltfilt(sos, x, axis=0, padtype="odd", padlen=pad)
 
 
+def zero_phase_gain(
+    f: Float[np.ndarray, " frequencies"], cutoffs: Float[np.ndarray, " cutoffs"]
+) -> Float[np.ndarray, "cutoffs frequencies"]:
+    """What `zero_phase` leaves of frequencies [Hz] far below half the rate."""
+    return 1 / (1 + (f / cutoffs[:, None]) ** (2 * _ORDER))
+
+
 def derivatives(
     q: Float[np.ndarray, "time dof"], cutoff: float, rate: float
 ) -> tuple[Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"]]:

@@ -373,19 +373,11 @@ def test_a_gear_that_stiffens_twists_less(motion):
     assert np.sqrt(np.mean(stiff**2)) < 0.9 * np.sqrt(np.mean(soft**2))
 
 
-def test_a_bias_that_wandered_returns_to_its_mean_after_what_was_recorded():
-    effect = TorqueDrift(0, 9.0, "wandering", until=20.0)
+@pytest.mark.parametrize("period", [9.0, 30.0])
+def test_a_bias_that_wandered_returns_to_its_mean_as_far_as_that_was_seen(period):
+    effect = TorqueDrift(0, period, "wandering", until=20.0)
     c, none = np.array([0.01, 0.3, 0.2, -0.4, 0.1, 0.2]), np.zeros(7)
     bias = lambda t: float(effect.at(Channels(jnp.asarray(t), none, none, none, none, none)) @ c)
     mean = np.mean([bias(t) for t in np.linspace(0, 20, 2001)])
     assert bias(20.0 + 1e-9) == pytest.approx(bias(20.0), abs=1e-6)
-    assert bias(100.0) == pytest.approx(mean, abs=1e-3)
-
-
-def test_a_bias_of_which_less_than_a_period_was_seen_stays_where_it_is():
-    """Its mean is of the part that was seen; the sensor had left it behind, and went on."""
-    effect = TorqueDrift(0, 30.0, "wave", until=20.0)
-    c, none = np.array([0.01, 0.3, 0.2, -0.4]), np.zeros(7)
-    bias = lambda t: float(effect.at(Channels(jnp.asarray(t), none, none, none, none, none)) @ c)
-    assert bias(100.0) == pytest.approx(bias(20.0))
-    assert bias(19.0) != pytest.approx(bias(20.0), abs=1e-3)
+    assert bias(300.0) == pytest.approx(mean * 20 / (20 + period), abs=1e-3)

@@ -45,6 +45,7 @@ from .resting import AtRest, judge, rests
 from .search import transferable
 from .state import State, with_terms
 from .traces import Trace, prepare
+from .turning import turning_as
 from .uncertainty import polished
 from .unnamed import BEYOND
 
@@ -236,6 +237,7 @@ def diagnose(
     found = (*found, *wrong)
     corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
     corrected = _buildable(source, corrected, problem)
+    corrected = turning_as(in_question, corrected, problem.noise(()).std)
     fitted = fit(problem, kept)
     if any(lost):
         dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
@@ -260,6 +262,7 @@ def diagnose(
             *(n for t in traces for n in _still(t)),
             *_unheard(problem),
             *_turned(problem, state),
+            *_turning(corrected),
             *(n for t in traces for n in t.signals.notes),
             *warnings,
         ),
@@ -312,6 +315,16 @@ def _turned(problem: Problem, state: State) -> list[str]:
     return [
         f"the model's friction at joint{'s' * (len(joints) > 1)} {', '.join(joints)} turns over another range of"
         " speeds than MuJoCo's constraint does, which is no finding (solreffriction and solimpfriction set it)"
+    ]
+
+
+def _turning(corrected: Corrected) -> list[str]:
+    """A sentence where predictions turn known friction otherwise than MuJoCo does."""
+    if corrected.turning is None:
+        return []
+    return [
+        f"`predict` turns the model's Coulomb friction over {corrected.turning:g} rad/s, which is nearer to the"
+        " recordings than MuJoCo's constraint, by which corrected.xml and simulations turn it"
     ]
 
 
@@ -532,7 +545,7 @@ def predict(
     corrected, noise = read(folder, effects)
     recording = motion if isinstance(motion, Recording) else load(motion)
     recording.require_dof(corrected.arm.dof)
-    trace = prepare(recording, corrected.arm, whole=True, noise=noise)
+    trace = prepare(recording, corrected.arm, whole=True, noise=noise, turning=corrected.turning)
     tau = corrected.measured_torque(trace.motion, trace.channels, trace.sign)
     grid = trace.motion.time
     return np.stack([np.interp(recording.time, grid, column) for column in tau.T], 1)

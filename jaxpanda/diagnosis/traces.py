@@ -31,9 +31,13 @@ _LEAST_CUTOFF, _LEAST_WHOLE = 5.0, 2.5
 """The least low-pass of q for a diagnosis, and for a prediction [Hz]."""
 _WINDOW, _SMOOTH = 4.0, 3.0
 """For the spectrum of the acceleration: a stretch [s], and a low-pass by which a motion is smooth [Hz]."""
-_BANDS, _COUNTS = ((0.15, 0.25), (0.25, 0.35), (0.35, 0.5)), 4.0
+_BANDS, _COUNTS = ((0.15, 0.25), (0.25, 0.35), (0.35, 0.5)), 2.0
 """Shares of the rate between which noise of q is told; and how often it counts against motion, as filled gaps and
 other joints' inertia put more of it into the torque."""
+_CUTOFFS = 60
+"""Of which the best is taken."""
+_WIDER = 1.15
+"""Within which ratio of frequencies power is averaged before it is told from noise."""
 TRIM = 0.4
 """Left out at both ends of a recording [s]."""
 _REST = 5.0
@@ -43,6 +47,8 @@ _HELD = 0.01
 way by 2 to 4 mrad before they break away."""
 _GAP, _NEAR = 3.5, 0.12
 """Missing steps that make a gap, and how far beyond it samples do not count [s]."""
+_BESIDE_GAP, _LEAST_BESIDE = 0.06, 8
+"""Rows beside a gap that tell where and how fast the arm was: of so long [s], and at least so many."""
 _TURN = 0.01
 """How long before or after a joint turns its known friction may [s]: MuJoCo's constraint does so before the
 velocity changes sign, the friction of a gear after it, and a filtered velocity shows neither."""
@@ -164,7 +170,12 @@ class Trace:
 
 
 def prepare(
-    recording: Recording, arm: Arm, *, whole: bool = False, noise: Float[np.ndarray, " dof"] | None = None
+    recording: Recording,
+    arm: Arm,
+    *,
+    whole: bool = False,
+    noise: Float[np.ndarray, " dof"] | None = None,
+    turning: float | None = None,
 ) -> Trace:
     """A recording on its two grids.
 
@@ -173,12 +184,11 @@ def prepare(
         arm: whose nominal torque is to be compared.
         whole: one grid for all, ends and gaps included, as prediction needs.
         noise: of the torque [N m], where the recording does not tell.
+        turning: velocity over which the arm's Coulomb friction turns [rad/s]; None: as MuJoCo's constraint does.
     """
     rough = signals_.prepare(recording, cutoff=3.0, rate=WORK_RATE, trim=0.0 if whole else TRIM)
     rate, time = rough.rate, rough.time
-    position = scipy.interpolate.CubicSpline(recording.time, recording.q)(
-        np.clip(time, *recording.time[[0, -1]])
-    )
+    position = _positions(recording.time, recording.q, time, rate)
     if noise is None and rough.tau is not None:
         noise = signals_.white_noise(rough.tau)
     if whole:
@@ -196,7 +206,7 @@ def prepare(
     kept, dt = (keep - fine[0]) // thin, thin / rate
     cutoff = min(0.4 * rate / stride, 0.45 * rate)
 
-    sign = held_sign(arm, qd[fine], qdd[fine], width)
+    sign = held_sign(arm, qd[fine], qdd[fine], width) if turning is None else np.tanh(qd[fine] / turning)
     doubtful = _unsure_sign(position, qd, width + _TURN * np.abs(qdd), cutoff_q, rate)[fine][kept]
     held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
     held, tau = held_fine[kept], None if rough.tau is None else rough.tau[keep]
@@ -253,6 +263,35 @@ def _stuck(
             if inside.any() and np.ptp(motion.torque[inside, joint]) > _MOVES * max(noise[joint], written):
                 out.append((joint, start, stop))
     return tuple(out)
+
+
+def _positions(
+    rows: Float[np.ndarray, " rows"],
+    q: Float[np.ndarray, "rows dof"],
+    time: Float[np.ndarray, " time"],
+    rate: float,
+) -> Float[np.ndarray, "time dof"]:
+    """q at the times of the grid: a spline through all rows; across a gap, where that would multiply the noise
+    by the gap's length in rows, the cubic that meets parabolas fitted to the rows on either side."""
+    out = scipy.interpolate.CubicSpline(rows, q)(np.clip(time, *rows[[0, -1]]))
+    gaps = np.flatnonzero(np.diff(rows) > _GAP / rate)
+    runs = np.concatenate([[0], gaps + 1, [len(rows)]])
+    reach = max(_LEAST_BESIDE, round(_BESIDE_GAP * rate))
+    for i, k in enumerate(gaps):
+        before, after = (
+            slice(max(runs[i], k + 1 - reach), k + 1),
+            slice(k + 1, min(runs[i + 2], k + 1 + reach)),
+        )
+        inside = (time > rows[k]) & (time < rows[k + 1])
+        if min(before.stop - before.start, after.stop - after.start) < _LEAST_BESIDE or not inside.any():
+            continue
+        ends = [
+            np.polynomial.polynomial.polyfit(rows[p] - rows[at], q[p], 2)
+            for p, at in ((before, k), (after, k + 1))
+        ]
+        value, slope = (np.stack([end[order] for end in ends]) for order in (0, 1))
+        out[inside] = scipy.interpolate.CubicHermiteSpline(rows[k : k + 2], value, slope)(time[inside])
+    return out
 
 
 def _weight(
@@ -364,8 +403,8 @@ def _clearest_cutoff(
     r"""Where a low-pass leaves least of both in the torque: noise of $\ddot q$ below it, motion above it [Hz].
 
     A diagnosis can weigh down samples whose motion the filter takes away; a prediction has to have them. Power
-    of $\ddot q$ less that of q's noise is the motion's; joints count by $(M_{jj}/\sigma_{\tau,j})^2$. The noise
-    is white, or that of a smooth motion written in steps.
+    of $\ddot q$ is the motion's where it stands so far above that of q's noise that it is worth its noise; joints
+    count by $(M_{jj}/\sigma_{\tau,j})^2$. The noise is white, or that of a smooth motion written in steps.
     """
     M = np.diag(masses(arm, q.mean(0)[None])[0])
 
@@ -383,11 +422,15 @@ def _clearest_cutoff(
         [np.median(levels[(f[1:] > low * rate) & (f[1:] <= high * rate)], 0) for low, high in _BANDS], 0
     )
     shaken = np.maximum(white * twice, rounding)
-    moved = np.maximum(power - shaken, 0.0)
-    left = np.cumsum(_COUNTS * shaken, 0) + moved.sum(0) - np.cumsum(moved, 0)
+    reach = np.searchsorted(f, f / _WIDER), np.searchsorted(f, f * _WIDER, side="right")
+    sums = np.cumsum(np.concatenate([np.zeros((1, q.shape[1])), power]), 0)
+    level = (sums[reach[1]] - sums[reach[0]]) / np.maximum(reach[1] - reach[0], 1)[:, None]
+    moved = np.where(level > (1 + _COUNTS) * shaken, power, 0.0)
     unit = M if noise is None else M / np.maximum(noise, 1e-12)
-    best = f[np.argmin(left @ unit**2)]
-    return float(np.clip(best, min(_LEAST_WHOLE, 0.25 * rate), 0.25 * rate))
+    cutoffs = np.geomspace(min(_LEAST_WHOLE, 0.25 * rate), 0.25 * rate, _CUTOFFS)
+    passed = signals_.zero_phase_gain(f, cutoffs)
+    left = (1 - passed) ** 2 @ moved + _COUNTS * passed**2 @ shaken
+    return float(cutoffs[np.argmin(left @ unit**2)])
 
 
 def _least_step(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:

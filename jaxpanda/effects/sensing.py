@@ -95,8 +95,8 @@ class TorqueDrift(AbstractInstantEffect):
 
     After `until` [s], the end of what was recorded, it goes on as `settling` says. Form "extra" is without the
     constant; "wave" is $a\,t + b + s \sin(2\pi t/T) + c \cos(2\pi t/T)$, a bias that wanders; "wandering" adds
-    half the period to it. What wanders goes on to nobody knows where: after `until` it returns to its mean within
-    $T/2\pi$, or stays where it is if less than T was recorded.
+    half the period to it. What wanders goes on to nobody knows where: after `until` it returns within $T/2\pi$
+    to its usual value, of which each period that was recorded tells as much as the user's model, which has none.
     """
 
     name: ClassVar[str] = "torque_drift"
@@ -158,10 +158,8 @@ class TorqueDrift(AbstractInstantEffect):
             ends = [k * self.until for k in waves]
             means = [m for x in ends for m in ((1 - jnp.cos(x)) / x, jnp.sin(x) / x)]
             mean = jnp.stack([0.5 * self.until * one, one, *means])
-            kept = jnp.where(
-                self.time_constant > self.until, 1.0, jnp.exp(-w * jnp.maximum(s.t - self.until, 0.0))
-            )
-            return mean + (jnp.stack(now) - mean) * kept
+            usual = mean * self.until / (self.until + self.time_constant)
+            return usual + (jnp.stack(now) - usual) * jnp.exp(-w * jnp.maximum(s.t - self.until, 0.0))
         g = settling(s.t, self.time_constant, self.until)
         return jnp.stack([g] if self.form == "extra" else [g, one])
 
