@@ -274,9 +274,7 @@ def _least(
     """One row a shape."""
     design, noise = state.design, state.noise
     effect = effects[0]
-    leading = 3 if isinstance(effect, ExternalContact) else 1
-    if effect.name == "gravity_direction":
-        leading = len(effect.coefficients)
+    leading = min(effect.size_of[1], len(effect.coefficients))
     columns = [c[..., :leading] for c in columns]
     if isinstance(effect, AbstractJointEffect):
         j = effect.joints[0]
@@ -296,14 +294,10 @@ def _least(
     delta = 2 * (_PAID - effect.prior)
     joint = effect.joints[0] if len(effect.joints) == 1 else None
     coefficient = effect.coefficients[0]
-    name = {"external_contact": "force", "gravity_direction": "gravity"}.get(effect.name, coefficient.name)
+    name = effect.size_of[0] or coefficient.name
     out = []
     for m in range(len(effects)):
-        k = (
-            int(np.argmin(left[m]))
-            if effect.name == "gravity_direction"
-            else int(np.argsort(left[m])[leading // 2])
-        )
+        k = int(np.argsort(left[m])[0 if effect.weakest_counts else leading // 2])
         shown = share[m, k] > 1e-6 and raw[m, k] > 0
         c = float(np.sqrt(delta / left[m, k])) if shown else None
         rms = None if c is None else float(c * size[m, k])

@@ -6,19 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, AbstractJointEffect
-from ..effects.contact import ExternalContact
-from ..effects.drive import Backlash
-from ..effects.friction import AsymmetricFriction
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem
 from .shapes import clock, projection
 
-LASTING = 0.8
-"""Share of its recording that a contact takes at most."""
 _GIVEN = 0.2
-CLEAR = 4.0
-"""Standard deviations by which a gap must differ from none."""
 AFRESH = 0.1
 """What of a drift differs at least between two repeats of a motion, as a share of what comes again."""
 AFRESH_EVENT = 0.5
@@ -27,29 +20,30 @@ AFRESH_EVENT = 0.5
 
 def is_credible(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
     """Whether a proposal is what it calls itself."""
-    tests = is_dissipative, has_play, is_of_time
+    tests = is_dissipative, is_clear, is_of_time
     return is_event(problem, proposal.effect) and all(
         test(problem, design, noise, proposal) for test in tests
     )
 
 
 def is_event(problem: Problem, effect: AbstractEffect) -> bool:
-    """Whether what calls itself a contact leaves some of its recording alone: a force that is always there says
+    """Whether what calls itself an event leaves some of its recording alone: a force that is always there says
     nothing of when, and takes what several joints' own effects explain together for one."""
-    if not isinstance(effect, ExternalContact):
+    if effect.longest >= 1:
         return True
-    time = clock(problem, effect.recording)
-    return float(effect.stop) - float(effect.start) < LASTING * float(time[-1] - time[0])
+    time = clock(problem, effect.recording)  # pyright: ignore
+    lasts = float(effect.stop) - float(effect.start)  # pyright: ignore
+    return lasts < effect.longest * float(time[-1] - time[0])
 
 
 def is_dissipative(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
-    """Whether what calls itself friction that depends on the direction takes energy, whatever the direction.
+    """Whether what must take energy does so, whatever the direction.
 
     Its even part may have either sign, but not exceed the odd one, with what the model has of friction: or it is
     a torque that does not know the direction, and no friction.
     """
     effect = proposal.effect
-    if not isinstance(effect, AsymmetricFriction):
+    if not effect.dissipates:
         return True
     j, (c, _) = effect.joints[0], fitted(problem, design, noise, proposal)
     power = [
@@ -60,15 +54,16 @@ def is_dissipative(problem: Problem, design: Design, noise: Noise, proposal: Pro
     return bool(-power[power < 0].sum() < _GIVEN * power[power > 0].sum())
 
 
-def has_play(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
-    """Whether what calls itself backlash moves across its gap, and does not only swing at its stops.
+def is_clear(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
+    """Whether the first coefficient, without which an effect is another one, differs from none.
 
-    Swings alone, with no motion lost, are what an elastic joint makes of noise.
+    Backlash moves across its gap; swings alone, with no motion lost, are what an elastic joint makes of noise.
     """
-    if not isinstance(proposal.effect, Backlash) or proposal.evidence < 0:
+    least = proposal.effect.clear_of_none
+    if not least or proposal.evidence < 0:
         return True
     c, covariance = fitted(problem, design, noise, proposal)
-    return bool(c[0] > CLEAR * np.sqrt(covariance[0, 0]))
+    return bool(c[0] > least * np.sqrt(covariance[0, 0]))
 
 
 def is_of_time(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:

@@ -23,28 +23,6 @@ _POINTS = 900
 """Points of a cloud, and stretches of a curve, that a figure draws."""
 _TONES = {"consistent": "good", "explained": "bad", "partly_explained": "unsure", "unexplained": "unsure"}
 _BEFORE, _AFTER, _FIT = "#e08a1e", "#1f6fb2", "#b3202a"
-_AGAINST = {
-    "viscous_friction": "velocity",
-    "coulomb_friction": "velocity",
-    "power_law_friction": "velocity",
-    "asymmetric_friction": "velocity",
-    "stribeck_friction": "velocity",
-    "load_dependent_friction": "|load|, turned by direction",
-    "friction_drift": "time, turned by direction",
-    "presliding_hysteresis": "reversal, turned by direction",
-    "torque_ripple": "position",
-    "joint_spring": "position",
-    "encoder_offset": "position",
-    "gravity_direction": "first joint",
-    "armature": "acceleration",
-    "joint_elasticity": "load",
-    "backlash": "load",
-    "torque_gain": "model torque",
-    "torque_crosstalk": "source torque",
-    "inertial_parameters": "model torque",
-    "payload": "model torque",
-}
-"""What a finding's residual is drawn against; time where nothing stands here."""
 
 
 def sections(found: Diagnosis) -> list[Section]:
@@ -166,7 +144,8 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
     rows = [np.flatnonzero(t.weight * on > 0) for t, on in zip(problem.traces, problem.active, strict=True)]
     fits = [np.asarray(f)[k, joint] for f, k in zip(own, rows, strict=True)]
     lefts = [a[k, joint] + f for a, k, f in zip(after, rows, fits, strict=True)]
-    against = "time" if effect is None else _AGAINST.get(one.effect, "time")
+    seen_against = {c.name: c.seen_against for c in problem.catalogue}
+    against = "time" if effect is None else seen_against.get(one.effect, "time")
     if effect is not None and effect.name == "unknown":
         against = _of(effect)
     label, x, turned = _regime(found, effect, joint, against)

@@ -35,8 +35,9 @@ class ExternalContact(AbstractArmEffect):
         Shape("stop", "s", -np.inf, np.inf, False),
     )
     reveals: ClassVar[str] = "the same motion again: a contact does not come back with it"
-    confounded_with: ClassVar[tuple[str, ...]] = ("payload_change", "torque_drift")
     bound_to_recording: ClassVar[bool] = True
+    longest: ClassVar[float] = 0.8
+    size_of: ClassVar[tuple[str, int]] = ("force", 3)
     repeats: ClassVar[bool] = True
 
     link: int = eqx.field(static=True)

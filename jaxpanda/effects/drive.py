@@ -27,8 +27,8 @@ class Armature(AbstractInstantEffect):
 
     name: ClassVar[str] = "armature"
     family: ClassVar[str] = "drive"
+    seen_against: ClassVar[str] = "acceleration"
     reveals: ClassVar[str] = "high accelerations in several poses of the joints beyond"
-    confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "joint_spring")
 
     joint: Joint
     form: str = eqx.field(static=True, default="")
@@ -77,9 +77,9 @@ class JointSpring(AbstractInstantEffect):
 
     name: ClassVar[str] = "joint_spring"
     family: ClassVar[str] = "load"
+    seen_against: ClassVar[str] = "position"
     prior: ClassVar[float] = -28.0
     reveals: ClassVar[str] = "the joint's full range at rest, in different poses of the arm"
-    confounded_with: ClassVar[tuple[str, ...]] = ("torque_offset", "inertial_parameters", "encoder_offset")
 
     joint: Joint
     form: str = eqx.field(static=True)
@@ -190,10 +190,10 @@ class TorqueRipple(AbstractInstantEffect):
 
     name: ClassVar[str] = "torque_ripple"
     family: ClassVar[str] = "drive"
+    seen_against: ClassVar[str] = "position"
     repeats: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("order", "1/rad", 2.5, 600.0),)
     reveals: ClassVar[str] = "a sweep of speeds: the frequency moves with it, the order stays"
-    confounded_with: ClassVar[tuple[str, ...]] = ("joint_spring", "inertial_parameters")
 
     joint: Joint
     order: Float[Array, ""] | float
@@ -244,6 +244,7 @@ class JointElasticity(AbstractArmEffect):
 
     name: ClassVar[str] = "joint_elasticity"
     family: ClassVar[str] = "drive"
+    seen_against: ClassVar[str] = "load"
     prior: ClassVar[float] = -40.0
     discrepancy: ClassVar[float] = 0.15
     varies_with: ClassVar[tuple[str, ...]] = ("moments",)
@@ -254,12 +255,6 @@ class JointElasticity(AbstractArmEffect):
     )
     reveals: ClassVar[str] = (
         "heavy and light load in the same pose; bursts of high frequency; both encoders, if any"
-    )
-    confounded_with: ClassVar[tuple[str, ...]] = (
-        "encoder_offset",
-        "time_delay",
-        "backlash",
-        "inertial_parameters",
     )
 
     joint: Joint
@@ -363,19 +358,16 @@ class Backlash(AbstractArmEffect):
 
     name: ClassVar[str] = "backlash"
     family: ClassVar[str] = "drive"
+    seen_against: ClassVar[str] = "load"
     discrepancy: ClassVar[float] = 0.3
     varies_with: ClassVar[tuple[str, ...]] = ("moments",)
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
+    clear_of_none: ClassVar[float] = 4.0
     shapes: ClassVar[tuple[Shape, ...]] = (
         Shape("half_width", "rad", 2e-4, 0.1, pivot=True),
         Shape("stop_stiffness", "N·m/rad", 2000.0, 1e5),
     )
     reveals: ClassVar[str] = "slow motion through poses where the load changes sign"
-    confounded_with: ClassVar[tuple[str, ...]] = (
-        "encoder_offset",
-        "presliding_hysteresis",
-        "joint_elasticity",
-    )
 
     joint: Joint
     half_width: Float[Array, ""] | float

@@ -79,7 +79,8 @@ class AbstractEffect(eqx.Module):
     shapes: ClassVar[tuple[Shape, ...]] = ()
     reveals: ClassVar[str] = ""
     """The motion that shows the effect, and tells it from what it is confounded with."""
-    confounded_with: ClassVar[tuple[str, ...]] = ()
+    seen_against: ClassVar[str] = "time"
+    """What its torque is drawn against."""
     prior: ClassVar[float] = -25.0
     """Logarithm of the odds, beforehand, that it is somewhere where it is not in the model."""
     discrepancy: ClassVar[float] = 0.02
@@ -100,6 +101,17 @@ class AbstractEffect(eqx.Module):
     """Whether it changes with the clock; nobody knows how it goes on after what was recorded (`beyond`)."""
     bound_to_recording: ClassVar[bool] = False
     """Whether it happened at some time in a recording; `placed` says what that means for others."""
+    longest: ClassVar[float] = 1.0
+    """Share of its recording that an event takes at most: what is always there says nothing of when."""
+    dissipates: ClassVar[bool] = False
+    """Whether it must take energy whatever the direction, or is none: a torque that knows no direction."""
+    clear_of_none: ClassVar[float] = 0.0
+    """Standard deviations by which its first coefficient must exceed zero; else it is another effect."""
+    size_of: ClassVar[tuple[str, int]] = ("", 1)
+    """Of the smallest size that recordings show: its name ("": that of the first coefficient), and how many
+    coefficients, the first ones, are components of it."""
+    weakest_counts: ClassVar[bool] = False
+    """Whether that size is told of the component that shows least, not of the middle one."""
 
     @classmethod
     @abc.abstractmethod

@@ -42,9 +42,9 @@ class ViscousFriction(AbstractInstantEffect):
 
     name: ClassVar[str] = "viscous_friction"
     family: ClassVar[str] = "friction"
+    seen_against: ClassVar[str] = "velocity"
     reveals: ClassVar[str] = "runs at four or more constant speeds, in both directions"
     prior: ClassVar[float] = COMMON
-    confounded_with: ClassVar[tuple[str, ...]] = ("coulomb_friction", "time_delay")
 
     joint: Joint
     form: str = eqx.field(static=True, default="")
@@ -78,14 +78,10 @@ class CoulombFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "coulomb_friction"
     family: ClassVar[str] = "friction"
+    seen_against: ClassVar[str] = "velocity"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("v0", "rad/s", 1e-3, 0.06),)
     reveals: ClassVar[str] = "reversals, with dwells between them"
     prior: ClassVar[float] = COMMON
-    confounded_with: ClassVar[tuple[str, ...]] = (
-        "presliding_hysteresis",
-        "stribeck_friction",
-        "asymmetric_friction",
-    )
 
     joint: Joint
     v0: Float[Array, ""] | float
@@ -128,10 +124,10 @@ class PowerLawFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "power_law_friction"
     family: ClassVar[str] = "friction"
+    seen_against: ClassVar[str] = "velocity"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("exponent", "1", 0.35, 3.0),)
     reveals: ClassVar[str] = ViscousFriction.reveals
     prior: ClassVar[float] = -28.0
-    confounded_with: ClassVar[tuple[str, ...]] = ("viscous_friction", "coulomb_friction", "stribeck_friction")
 
     joint: Joint
     exponent: Float[Array, ""] | float
@@ -172,10 +168,11 @@ class AsymmetricFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "asymmetric_friction"
     family: ClassVar[str] = "friction"
+    seen_against: ClassVar[str] = "velocity"
+    dissipates: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
     reveals: ClassVar[str] = "rests of 0.3 s and more, and motion in both directions"
     prior: ClassVar[float] = -28.0
-    confounded_with: ClassVar[tuple[str, ...]] = ("torque_offset", "coulomb_friction")
 
     joint: Joint
     v0: Float[Array, ""] | float
@@ -281,10 +278,10 @@ class LoadDependentFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "load_dependent_friction"
     family: ClassVar[str] = "friction"
+    seen_against: ClassVar[str] = "|load|, turned by direction"
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH, Shape("exponent", "1", 0.6, 1.6))
     reveals: ClassVar[str] = "the same speed in loaded and unloaded poses; with and without payload"
     prior: ClassVar[float] = -28.0
-    confounded_with: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_gain", "friction_drift")
 
     joint: Joint
     v0: Float[Array, ""] | float
@@ -369,14 +366,10 @@ class FrictionDrift(AbstractDryFriction):
 
     name: ClassVar[str] = "friction_drift"
     family: ClassVar[str] = "friction"
+    seen_against: ClassVar[str] = "time, turned by direction"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0), _WIDTH)
     reveals: ClassVar[str] = "the same motion cold and warm"
     prior: ClassVar[float] = -28.0
-    confounded_with: ClassVar[tuple[str, ...]] = (
-        "coulomb_friction",
-        "load_dependent_friction",
-        "torque_drift",
-    )
     drifts: ClassVar[bool] = True
 
     joint: Joint

@@ -73,8 +73,8 @@ class InertialParameters(AbstractArmEffect):
 
     name: ClassVar[str] = "inertial_parameters"
     family: ClassVar[str] = "load"
+    seen_against: ClassVar[str] = "model torque"
     reveals: ClassVar[str] = "an identification motion; a reference recording from before"
-    confounded_with: ClassVar[tuple[str, ...]] = ("payload", "joint_spring", "torque_gain", "encoder_offset")
 
     link: int = eqx.field(static=True)
     standard: tuple[float, ...] = eqx.field(static=True)
@@ -126,8 +126,8 @@ class Payload(AbstractArmEffect):
 
     name: ClassVar[str] = "payload"
     family: ClassVar[str] = "load"
+    seen_against: ClassVar[str] = "model torque"
     reveals: ClassVar[str] = "a recording without the load, of the same motion"
-    confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "torque_gain")
 
     link: int = eqx.field(static=True)
 
@@ -173,7 +173,6 @@ class PayloadChange(AbstractArmEffect):
     family: ClassVar[str] = "load"
     prior: ClassVar[float] = -28.0
     reveals: ClassVar[str] = "the same poses before and after"
-    confounded_with: ClassVar[tuple[str, ...]] = ("external_contact", "torque_drift")
     bound_to_recording: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
 
@@ -265,8 +264,10 @@ class GravityDirection(AbstractArmEffect):
 
     name: ClassVar[str] = "gravity_direction"
     family: ClassVar[str] = "load"
+    seen_against: ClassVar[str] = "first joint"
+    size_of: ClassVar[tuple[str, int]] = ("gravity", 3)
+    weakest_counts: ClassVar[bool] = True
     reveals: ClassVar[str] = "the first joint turned over 180 degrees"
-    confounded_with: ClassVar[tuple[str, ...]] = ("joint_spring", "torque_offset", "inertial_parameters")
 
     across: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     dof: int = eqx.field(static=True)

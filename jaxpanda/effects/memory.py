@@ -43,14 +43,9 @@ class PreslidingHysteresis(AbstractMemoryEffect):
 
     name: ClassVar[str] = "presliding_hysteresis"
     family: ClassVar[str] = "friction"
+    seen_against: ClassVar[str] = "reversal, turned by direction"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("breakaway_distance", "rad", 1e-4, 0.2),)
     reveals: ClassVar[str] = "slow reversals of half to five breakaway distances"
-    confounded_with: ClassVar[tuple[str, ...]] = (
-        "coulomb_friction",
-        "stribeck_friction",
-        "backlash",
-        "time_delay",
-    )
 
     joint: Joint
     breakaway_distance: Float[Array, ""] | float

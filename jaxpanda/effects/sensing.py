@@ -22,11 +22,6 @@ class TorqueOffset(AbstractInstantEffect):
     name: ClassVar[str] = "torque_offset"
     family: ClassVar[str] = "sensor"
     reveals: ClassVar[str] = "rests, and poses on both sides of the joint's zero of gravity"
-    confounded_with: ClassVar[tuple[str, ...]] = (
-        "asymmetric_friction",
-        "joint_spring",
-        "inertial_parameters",
-    )
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
@@ -62,8 +57,8 @@ class TorqueGain(AbstractInstantEffect):
 
     name: ClassVar[str] = "torque_gain"
     family: ClassVar[str] = "sensor"
+    seen_against: ClassVar[str] = "model torque"
     reveals: ClassVar[str] = "a known load at the flange"
-    confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "payload", "load_dependent_friction")
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
@@ -104,7 +99,6 @@ class TorqueDrift(AbstractInstantEffect):
     prior: ClassVar[float] = -28.0
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0),)
     reveals: ClassVar[str] = "the same poses early and late"
-    confounded_with: ClassVar[tuple[str, ...]] = ("payload_change", "friction_drift", "torque_offset")
     drifts: ClassVar[bool] = True
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
@@ -182,8 +176,8 @@ class TorqueCrosstalk(AbstractInstantEffect):
 
     name: ClassVar[str] = "torque_crosstalk"
     family: ClassVar[str] = "sensor"
+    seen_against: ClassVar[str] = "source torque"
     reveals: ClassVar[str] = "poses in which the two joints' torques differ"
-    confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction")
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
     takes_shown: ClassVar[bool] = True
 
@@ -221,9 +215,9 @@ class EncoderOffset(AbstractArmEffect):
 
     name: ClassVar[str] = "encoder_offset"
     family: ClassVar[str] = "sensor"
+    seen_against: ClassVar[str] = "position"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "rad", -0.6, 0.6, False, pivot=True),)
     reveals: ClassVar[str] = "the joint at rest over its range; with and without payload"
-    confounded_with: ClassVar[tuple[str, ...]] = ("inertial_parameters", "gravity_direction", "joint_spring")
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"
 
     joint: Joint
@@ -274,11 +268,6 @@ class TimeDelay(AbstractArmEffect):
     prior: ClassVar[float] = -45.0
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "s", 1e-4, 0.2, pivot=True),)
     reveals: ClassVar[str] = "fast reversals"
-    confounded_with: ClassVar[tuple[str, ...]] = (
-        "viscous_friction",
-        "presliding_hysteresis",
-        "joint_elasticity",
-    )
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     dof: int = eqx.field(static=True)

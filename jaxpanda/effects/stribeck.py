@@ -37,17 +37,13 @@ class StribeckFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "stribeck_friction"
     family: ClassVar[str] = "friction"
+    seen_against: ClassVar[str] = "velocity"
     shapes: ClassVar[tuple[Shape, ...]] = (
         _VELOCITY,
         Shape("v0", "rad/s", 1e-3, 0.05),
     )
     reveals: ClassVar[str] = "slow ramps through zero velocity, in several poses"
     prior: ClassVar[float] = -28.0
-    confounded_with: ClassVar[tuple[str, ...]] = (
-        "coulomb_friction",
-        "presliding_hysteresis",
-        "viscous_friction",
-    )
 
     joint: Joint
     stribeck_velocity: Float[Array, ""] | float
@@ -121,7 +117,6 @@ class StribeckBristles(AbstractMemoryEffect):
     shapes: ClassVar[tuple[Shape, ...]] = (_VELOCITY, Shape("breakaway_distance", "rad", 1e-4, 0.05))
     reveals: ClassVar[str] = StribeckFriction.reveals
     prior: ClassVar[float] = StribeckFriction.prior
-    confounded_with: ClassVar[tuple[str, ...]] = StribeckFriction.confounded_with
 
     joint: Joint
     stribeck_velocity: Float[Array, ""] | float
