@@ -425,12 +425,29 @@ def _clearest_cutoff(
     reach = np.searchsorted(f, f / _WIDER), np.searchsorted(f, f * _WIDER, side="right")
     sums = np.cumsum(np.concatenate([np.zeros((1, q.shape[1])), power]), 0)
     level = (sums[reach[1]] - sums[reach[0]]) / np.maximum(reach[1] - reach[0], 1)[:, None]
+    shaken = np.maximum(shaken, _rising(f, level))
     moved = np.where(level > (1 + _COUNTS) * shaken, power, 0.0)
     unit = M if noise is None else M / np.maximum(noise, 1e-12)
     cutoffs = np.geomspace(min(_LEAST_WHOLE, 0.25 * rate), 0.25 * rate, _CUTOFFS)
     passed = signals_.zero_phase_gain(f, cutoffs)
     left = (1 - passed) ** 2 @ moved + _COUNTS * passed**2 @ shaken
     return float(cutoffs[np.argmin(left @ unit**2)])
+
+
+def _rising(
+    f: Float[np.ndarray, " frequencies"], power: Float[np.ndarray, "frequencies dof"]
+) -> Float[np.ndarray, "frequencies dof"]:
+    r"""Noise of $\ddot q$ by the shape of its spectrum: that of a motion falls; where it rises, it is noise's.
+
+    Above the least power everything is noise, however coloured, as stamps that jitter make it; below it there is
+    what white noise of q would have there.
+    """
+    first = int(np.searchsorted(f, _SMOOTH))
+    out = np.zeros_like(power)
+    for j, p in enumerate(power.T):
+        knee = first + int(np.argmin(p[first:]))
+        out[:, j] = np.where(np.arange(len(f)) >= knee, p, p[knee] * (f / f[knee]) ** 4)
+    return out
 
 
 def _least_step(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
