@@ -17,7 +17,7 @@ from .problem import Problem, Term
 from .search import posterior
 from .state import State, leftover, places, without
 from .uncertainty import covariances
-from .unnamed import BEYOND, hum, standing_off, stuck
+from .unnamed import hum, standing_off, stuck
 
 LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05
 """When a joint is not fully explained: this share of its squared residual beyond noise is left, more than this
@@ -62,7 +62,8 @@ def findings(problem: Problem, state: State, laws: State, lost: Sequence[bool]) 
 def numbers(
     problem: Problem, state: State, changes: Callable[[Float[np.ndarray, " n"]], tuple[np.ndarray, ...]]
 ) -> list[Finding]:
-    """The model's own numbers as what is wrong, where their refit explains a joint far beyond its noise.
+    """The model's own numbers as what is wrong, where their refit explains more of a joint's torque than its
+    noise, what the refit is uncertain by taken off.
 
     `changes`: what coefficients of the nuisance mean for standard parameters, damping, frictionloss
     and armature.
@@ -70,15 +71,17 @@ def numbers(
     n = problem.nuisance[0].shape[2]
     values = changes(state.design.x[:n])
     root = np.linalg.cholesky(np.linalg.inv(state.design.information)[:n, :n])
-    deviations = [np.sqrt(np.sum(np.square(part), 0)) for part in zip(*map(changes, root.T), strict=True)]
+    moved = [changes(x) for x in root.T]
+    deviations = [np.sqrt(np.sum(np.square(part), 0)) for part in zip(*moved, strict=True)]
     suspect = [t for t, on in zip(problem.traces, problem.active, strict=True) if on]
     weights = np.concatenate([t.weights for t in suspect])
-    felt = (
-        [t.motion.regressor @ values[0].ravel() for t in suspect],
-        [t.motion.qd * values[1] for t in suspect],
-        [t.down(t.sign) * values[2] for t in suspect],
-        [t.motion.qdd * values[3] for t in suspect],
-    )
+    regressor = np.concatenate([t.motion.regressor for t in suspect])
+    channels = [
+        np.concatenate(x)
+        for x in zip(*((t.motion.qd, t.down(t.sign), t.motion.qdd) for t in suspect), strict=True)
+    ]
+    torques = [lambda x: regressor @ x.ravel(), *(lambda x, of=of: of * x for of in channels)]
+    power = lambda torque: np.mean((torque * weights) ** 2, 0) / np.maximum(np.mean(weights**2, 0), 1e-9)
     told = (
         (InertialParameters.name, "mass_change", "kg", "Y(q, dq, ddq) * (change of inertial parameters)"),
         (ViscousFriction.name, "damping", "N·m·s/rad", "damping * dq, beyond the model's"),
@@ -86,13 +89,15 @@ def numbers(
         (Armature.name, "armature", "kg·m²", "armature * ddq, beyond the model's"),
     )
     out = []
-    for torque, value, std, (name, parameter, unit, law) in zip(felt, values, deviations, told, strict=True):
-        power = np.mean((np.concatenate(torque) * weights) ** 2, 0) / np.maximum(np.mean(weights**2, 0), 1e-9)
-        joints = tuple(np.flatnonzero(power > BEYOND * state.noise.std**2).tolist())
+    for k, (name, parameter, unit, law) in enumerate(told):
+        value, std, torque = values[k], deviations[k], torques[k]
+        felt = power(torque(value))
+        unsure = sum((power(torque(part[k])) for part in moved if np.any(part[k])), np.zeros(problem.dof))
+        joints = tuple(np.flatnonzero(felt - unsure > state.noise.std**2).tolist())
         if not joints:
             continue
         whole = value.ndim > 1  # links beyond a joint act in it
-        strongest = max(joints, key=lambda j: power[j])
+        strongest = max(joints, key=lambda j: felt[j])
         parts = ((j, value[j, 0], std[j, 0]) if whole else (j, value[j], std[j]) for j in range(problem.dof))
         out.append(
             Finding(
@@ -108,10 +113,10 @@ def numbers(
                     for j, v, s in parts
                     if whole or j in joints
                 ),
-                rms_torque=np.sqrt(power),
-                evidence=float(0.5 * len(weights) * np.sum(power / state.noise.std**2)),
+                rms_torque=np.sqrt(felt),
+                evidence=float(0.5 * len(weights) * np.sum(felt / state.noise.std**2)),
                 summary=f"The simulation's own numbers are not this arm's ({name.replace('_', ' ')}): refitted"
-                f" together they explain {np.sqrt(power[strongest]):.3g} N·m rms at joint {strongest + 1}."
+                f" together they explain {np.sqrt(felt[strongest]):.3g} N·m rms at joint {strongest + 1}."
                 " Torque sensors of a wrong scale could look alike.",
                 terms=(),
             )
