@@ -149,6 +149,17 @@ def of_known(
     return np.split(np.concatenate(parts, 2), np.cumsum(samples)[:-1])
 
 
+def slow_errors(
+    traces: Sequence[Trace], size: Float[np.ndarray, " dof"]
+) -> list[Float[np.ndarray, "_time dof _m"]]:
+    """Errors of the whole model that change slowly, whatever their cause, of unit variance: `size` [N m] in each
+    joint. No arm is quite its model, and what has no law may not be credited to several that it has none of."""
+    moments = _hats(traces, 0, "moments")
+    columns = [size[j] * moments[:, None, :] * np.eye(len(size))[j][:, None] for j in range(len(size))]
+    ends = np.cumsum([t.motion.samples for t in traces])[:-1]
+    return np.split(np.concatenate(columns, 2), ends)
+
+
 def _hats(traces: Sequence[Trace], joint: int, channel: str) -> Float[np.ndarray, "rows n"]:
     if channel == "moments":
         parts = [hats(t.motion.time, max(3, round(np.ptp(t.motion.time) / _PERIOD))) for t in traces]
