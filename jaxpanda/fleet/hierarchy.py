@@ -12,14 +12,15 @@ of $\chi^2_{n-p}$. Both are exact for normal estimates whose deviations are righ
 take Student's t with n - p degrees of freedom, as $\tau^2$ is estimated: wider than needed where recordings do
 not differ, right where they do (`tests/test_fleet_hierarchy.py`).
 
-A recording is set beside what the others foresee for it, as many times as there are recordings. Those that stand
-out are set apart one after the other, so that a second one is not hidden by the first; a few that stand out
-together on one side are scatter.
+A recording is set beside what the others foresee for it, as many times as there are recordings; the one that
+stands out most is left out, and so on, and as many are set apart as there were when one last stood out beyond
+chance (Rosner's generalised test, the chance shared out), so that two do not hide each other. More than a quarter
+of the recordings are scatter.
 
 References:
     Paule, Mandel, J. Res. NBS 1982; Viechtbauer, Stat. Med. 2007 (the interval); Knapp, Hartung, Stat. Med. 2003
-    (Student's t); Viechtbauer, Cheung, Res. Synth. Methods 2010 (deleted residuals); Benjamini, Hochberg, JRSS B
-    1995 (`discoveries`).
+    (Student's t); Viechtbauer, Cheung, Res. Synth. Methods 2010 (deleted residuals); Rosner,
+    Technometrics 1983; Benjamini, Hochberg, JRSS B 1995 (`discoveries`).
 """
 
 import dataclasses
@@ -27,7 +28,7 @@ import dataclasses
 import numpy as np
 import scipy.special
 import scipy.stats
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 LEVEL = 0.95
 """Of every interval."""
@@ -36,8 +37,10 @@ APART = 0.01
 FEWEST_TREND, FEWEST_ONCE, FEWEST_BOTH = 4, 5, 6
 """Recordings that a trend takes, one that stands out, and one that stands out of a trend."""
 _STEPS = 80
-_MOST_APART = 0.25
-"""Share of the recordings that may be set apart; what happens more often does not happen once."""
+_FIRST = 0.8
+"""Share of the chance of a false alarm that the first to be left out has; the others share the rest."""
+_MOST_APART = 10
+"""Recordings that may be set apart, of four times as many: what happens more often does not happen once."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,20 +102,18 @@ def history(
     y, v = value / scale, np.square(std / scale)
     when = None if time is None or np.ptp(time) == 0 or len(np.unique(time)) < FEWEST_TREND else time
     keep, once, p_once = _set_apart(y, v, when)
-    n = int(keep.sum())
-    centre = None if when is None else float(when[keep].mean())
-    # the mean without a trend, unless there is one to take out: a slope costs a degree of freedom
-    flat = np.ones((n, 1))
-    X, drift = flat, None
-    if when is not None and n >= FEWEST_TREND and np.ptp(when[keep]) > 0:
-        span = float(np.ptp(when[keep]))
-        sloped = np.stack([np.ones(n), (when[keep] - when[keep].mean()) / span], 1)
-        drift = _number(*_fit(y[keep], v[keep], sloped), 1, n - 2, scale / span)
-        if drift.p < 1 - LEVEL:
+    at = np.flatnonzero(keep)
+    y, v, n = y[at], v[at], len(at)
+    X, drift, centre = np.ones((n, 1)), None, None if when is None else float(when[at].mean())
+    sloped = _law(len(value), when, at, FEWEST_TREND)[at]
+    if when is not None and sloped.shape[1] == 2:
+        beta, covariance, _ = _fit(y, v, sloped)
+        drift = _number(beta, covariance, 1, n - 2, scale / float(np.ptp(when[at])))
+        if drift.p < 1 - LEVEL:  # else the mean is known better without: a slope costs a degree of freedom
             X = sloped
-    beta, covariance, tau2 = _fit(y[keep], v[keep], X)
-    mean = _number(beta, covariance, tau2, 0, n - X.shape[1], scale)
-    low, high = _interval(y[keep], v[keep], X)
+    beta, covariance, tau2 = _fit(y, v, X)
+    mean = _number(beta, covariance, 0, n - X.shape[1], scale)
+    low, high = _interval(y, v, X)
     return History(
         count=n,
         mean=mean,
@@ -140,22 +141,44 @@ def discoveries(p: Float[np.ndarray, " tests"], rate: float = 1 - LEVEL) -> Bool
 def _set_apart(
     y: Float[np.ndarray, " n"], v: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"] | None
 ) -> tuple[Bool[np.ndarray, " n"], list[Once], float | None]:
-    """Which recordings are left, which stand out, and the probability of the first."""
-    keep, out, first = np.ones(len(y), bool), [], None
-    while keep.sum() >= FEWEST_ONCE and len(out) <= _MOST_APART * len(y):
+    """Which recordings are left, which stand out, and the probability that chance makes any do so.
+
+    The one that stands out most is left out, then the next, whether or not that is beyond chance: two hide each
+    other. As many stand out as there were when one last did.
+    """
+    keep, left_out, chances = np.ones(len(y), bool), [], []
+    steps = min(_MOST_APART, len(y) // 4)
+    for step in range(steps):
         at = np.flatnonzero(keep)
-        X = np.ones((len(at), 1))
-        if time is not None and len(at) >= FEWEST_BOTH and np.ptp(time[at]) > 0:
-            X = np.stack([X[:, 0], (time[at] - time[at].mean()) / np.ptp(time[at])], 1)
-        expected, std, p = _foreseen(y[at], v[at], X)
-        i = int(np.argmin(p))
-        chance = float(min(1.0, len(at) * p[i]))
-        first = chance if first is None else first
-        if chance > APART or len(out) + 1 > _MOST_APART * len(y):
+        if len(at) < FEWEST_ONCE:
             break
-        out.append(Once(int(at[i]), float(y[at[i]]), float(expected[i]), float(std[i]), chance))
+        _, _, p = _foreseen(y[at], v[at], _law(len(y), time, at, FEWEST_BOTH)[at])
+        i = int(np.argmin(p))
+        left_out.append(int(at[i]))
+        share = 1.0 if steps == 1 else _FIRST if step == 0 else (1 - _FIRST) / (steps - 1)
+        chances.append(float(min(1.0, len(at) * p[i] / share)))
         keep[at[i]] = False
-    return keep, out, first
+    many = max((k + 1 for k, chance in enumerate(chances) if chance <= APART), default=0)
+    keep[left_out[many:]] = True
+    out = []
+    if many:
+        at = np.flatnonzero(keep)
+        every = _law(len(y), time, at, FEWEST_BOTH)
+        beta, covariance, tau2 = _fit(y[at], v[at], every[at])
+        for k, i in enumerate(left_out[:many]):
+            std = float(np.sqrt(tau2 + v[i] + every[i] @ covariance @ every[i]))
+            out.append(Once(i, float(y[i]), float(every[i] @ beta), std, min(chances[k:many])))
+    return keep, sorted(out, key=lambda one: one.index), min(chances, default=None)
+
+
+def _law(
+    count: int, time: Float[np.ndarray, " n"] | None, at: Int[np.ndarray, " m"], fewest: int
+) -> Float[np.ndarray, "n p"]:
+    """Columns of a mean and, if the estimates `at` are as many as `fewest` at several times, of a trend about
+    their mean time, in their span."""
+    if time is None or len(at) < fewest or np.ptp(time[at]) == 0:
+        return np.ones((count, 1))
+    return np.stack([np.ones(count), (time - time[at].mean()) / np.ptp(time[at])], 1)
 
 
 def _foreseen(
@@ -194,7 +217,6 @@ def _interval(
 def _number(
     beta: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "p p"],
-    _: float,
     at: int,
     freedom: int,
     unit: float,
@@ -231,7 +253,7 @@ def _paule_mandel(
     keep: Bool[np.ndarray, "m n"],
     wanted: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, " m"]:
-    """Where Q is as large as wanted, or 0, by Newton's steps on 1/Q, which is a straight line where all deviations
+    """Where Q is as large as wanted, or 0, by Newton's steps on 1/Q, which is a straight line where deviations
     are one."""
     tau2 = np.zeros(len(keep))
     for _ in range(_STEPS):
@@ -239,6 +261,6 @@ def _paule_mandel(
         step = Q * (Q - wanted) / (wanted * np.maximum(falls, 1e-300))
         step = np.maximum(step, -tau2)  # where Q is less from the start, 0 it stays
         tau2 = tau2 + step
-        if np.all(np.abs(step) <= 1e-10 * (1 + tau2)):
+        if np.all(np.abs(step) <= 1e-9 * (1 + tau2)):
             break
     return tau2
