@@ -15,7 +15,7 @@ from ..session import Tick, progress
 from .crew import crew, ray
 from .result import KIND, Fleet, require_parquet
 from .run import run
-from .table import Table, read_table
+from .table import Table, load_table
 from .work import Options
 
 MEMORY = 3.0
@@ -68,7 +68,7 @@ def diagnose_fleet(
         ray()
     out, reading = Path(out), Reading() if reading is None else reading
     read = (
-        table if isinstance(table, Table) else read_table(Path(table), None if model is None else Path(model))
+        table if isinstance(table, Table) else load_table(Path(table), None if model is None else Path(model))
     )
     for path in dict.fromkeys(row.model for row in read.rows if row.model is not None):
         from_mjcf(path, convention.mounting)

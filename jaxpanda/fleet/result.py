@@ -104,10 +104,10 @@ class Fleet:
         statuses = Counter(document["status"] for document in self.told.values())
         counts = ", ".join(f"{count} {status}" for status, count in sorted(statuses.items()))
         pace = f" {self.made / self.seconds * 60:.3g} a minute" if self.made and self.seconds > 0 else ""
-        kept = len(self.told) - self.made
+        kept = sum(bool(document["key"]) for document in self.told.values()) - self.made
         sentences = [f"{len(self.table.rows)} recordings of {len(self.arms)} arms: {counts}."]
         sentences.append(
-            f"Made now: {self.made} in {self.seconds:.0f} s,{pace or ' nothing'}; taken: {kept}."
+            f"Made now: {self.made} in {self.seconds:.0f} s,{pace or ' nothing'}; already there: {kept}."
         )
         rows = [
             [
@@ -125,9 +125,10 @@ class Fleet:
             for arm in self.arms[:_SHOWN]
         ]
         glance = ReportTable(
-            ["arm", "recordings", "off by × noise", "verdicts", "findings (in how many recordings)"],
+            ["arm", "recordings", "× noise", "verdicts", "findings (in how many recordings)"],
             rows,
-            "Arms, the one whose model is furthest off first" + _more(len(self.arms)),
+            "Arms, the worst first: by the torque that findings explain, over the noise"
+            + _more(len(self.arms)),
         )
         out = [Section("Fleet", sentences, [glance])]
         if claims := self.claims():

@@ -62,7 +62,7 @@ class Table:
     """Whether that column has dates, rather than numbers."""
 
 
-def read_table(path: Path, model: Path | None) -> Table:
+def load_table(path: Path, model: Path | None) -> Table:
     """The table in a CSV (cells between commas, semicolons or tabs, in quotation marks where needed).
 
     Args:
