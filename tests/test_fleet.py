@@ -1,9 +1,10 @@
 """A fleet: its table, its shards whoever makes them, what is left when workers die, and the page."""
 
 import csv
-import importlib
 import json
+import os
 import re
+import signal
 import types
 from collections import Counter
 from pathlib import Path
@@ -224,10 +225,17 @@ def test_the_first_and_the_last_healthy_recording_go_beside_the_others(tmp_path)
 # Workers
 
 
-class FakeRay(types.SimpleNamespace):
+class Ref:
+    """A call of a worker's, whose result is not there yet."""
+
+    def __init__(self, what):
+        self.what = what
+
+
+class FakeRay:
     """Ray as far as a crew needs it, in this process: workers that die when they are told to."""
 
-    def __init__(self, dies, uses=lambda task: 1):
+    class exceptions:
         class RayError(Exception):
             pass
 
@@ -237,41 +245,32 @@ class FakeRay(types.SimpleNamespace):
         class RayTaskError(RayError):
             pass
 
-        super().__init__(
-            exceptions=types.SimpleNamespace(
-                **{c.__name__: c for c in (RayError, RayActorError, RayTaskError)}
-            )
-        )
-        self.dies, self.uses = dies, uses
+    def __init__(self, dies, uses=lambda task: 1, begins=lambda: True):
+        self.dies, self.uses, self.begins = dies, uses, begins
         self.hired, self.killed, self.places = 0, 0, []
 
     def remote(self, **_):
-        def hire():
-            self.hired += 1
-            call = lambda make: types.SimpleNamespace(remote=make)
-            return types.SimpleNamespace(
-                node=call(lambda: ("node",)),
-                settle=call(self.places.append),
-                shard=call(lambda task: (task,)),
-                __hash__=None,
-            )
+        call = lambda make: types.SimpleNamespace(remote=make)
+        api = self
 
-        class Worker:
-            def __init__(self, inner):
-                self.__dict__.update(vars(inner))
+        class Actor:
+            node, settle, shard = call(lambda: Ref("node")), call(api.places.append), call(Ref)
 
-        return lambda _: types.SimpleNamespace(remote=lambda: Worker(hire()))
+            def __init__(self):
+                api.hired += 1
+
+        return lambda _: call(Actor)
 
     def get(self, reference):
-        (what,) = reference
-        if not isinstance(what, Task):
-            return what
-        if self.dies(what):
+        what = reference.what
+        if what == "node" and self.begins():
+            return "node"
+        if what == "node" or self.dies(what):
             raise self.exceptions.RayActorError("The actor died. And more.")
         return json.dumps({"key": what.key, "status": "diagnosed"}), self.uses(what)
 
     def wait(self, references, num_returns):
-        return references[:num_returns], references[num_returns:]
+        return references[-num_returns:], references[:-num_returns]
 
     def kill(self, worker):
         self.killed += 1
@@ -303,6 +302,13 @@ def test_a_recording_that_no_worker_survives_is_named_and_the_others_finish():
     assert Counter(d["status"] for d in made.values()) == {"diagnosed": 5, "lost": 1}
     assert made[1]["message"] == "r1.csv: 3 workers ended while they were at it, the last as The actor died"
     assert api.killed == crew.ATTEMPTS
+
+
+def test_workers_that_never_begin_are_given_up_on():
+    api = FakeRay(lambda task: False, begins=lambda: False)
+    with pytest.raises(InputError, match="no worker begins \\(The actor died"):
+        dict(crew._Crew(api, 2, None, 10).outcomes(tasks(6)))
+    assert api.hired < 20
 
 
 def test_a_worker_is_replaced_when_its_memory_passes_the_limit():
@@ -416,17 +422,13 @@ def test_ray_s_workers_make_the_same_bits_though_one_is_killed(moving, tmp_path,
     killed = []
 
     class Mortal(crew._Crew):
-        """The first worker that is given something is killed while it is at it."""
+        """The first worker that begins is killed when it has been given something."""
 
-        def _hire(self, count):
-            hired = super()._hire(count)
-            if not killed and self.idle:
-                killed.append(self.idle[-1])
-                busy = self.idle[-1].shard.remote(tasks(1)[0])
-                ray.kill(self.idle[-1])
-                with pytest.raises(ray.exceptions.RayActorError):
-                    ray.get(busy)
-            return hired
+        def _begin(self, where, *, alone):
+            worker = self.called[where]
+            super()._begin(where, alone=alone)
+            if not killed and worker in self.places:
+                killed.append(os.kill(ray.get(worker.process.remote()), signal.SIGKILL))
 
     monkeypatch.setattr(crew, "_Crew", Mortal)
     out = tmp_path / "ray"
@@ -444,14 +446,8 @@ def test_ray_s_workers_make_the_same_bits_though_one_is_killed(moving, tmp_path,
 
 def test_ray_is_told_to_send_nothing_home(monkeypatch):
     monkeypatch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
-    seen = []
-    monkeypatch.setattr(
-        crew,
-        "importlib",
-        types.SimpleNamespace(
-            import_module=lambda name: seen.append(__import__("os").environ["RAY_USAGE_STATS_ENABLED"])
-        ),
-    )
+    told = []
+    imported = lambda name: told.append(os.environ["RAY_USAGE_STATS_ENABLED"])
+    monkeypatch.setattr(crew, "importlib", types.SimpleNamespace(import_module=imported))
     crew.ray()
-    assert seen == ["0"]
-    assert importlib is not None
+    assert told == ["0"]

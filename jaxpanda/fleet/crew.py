@@ -74,6 +74,10 @@ class Worker:
         """Which machine this is."""
         return ray().get_runtime_context().get_node_id()
 
+    def process(self) -> int:
+        """Its number, for who wants to end it."""
+        return os.getpid()
+
     def settle(self, place: int) -> None:
         """Keep to one core, before anything is compiled: threads would only wait for other workers'."""
         if hasattr(os, "sched_setaffinity"):
@@ -95,31 +99,34 @@ class _Crew:
         self.actor = api.remote(num_cpus=1, max_restarts=0)(Worker)
         self.places: dict[Any, tuple[str, int]] = {}
         self.idle: list[Any] = []
+        self.called: dict[Any, Any] = {}
+        """Workers that have not begun yet, by what will say where they are."""
+        self.stillborn = 0
+        """Workers that have ended since one last began."""
 
     def outcomes(self, tasks: Sequence[Task]) -> Iterator[tuple[int, str]]:
         """`Outcomes`: each idle worker takes a task; what a worker had that ended goes to another."""
         waiting = deque((i, 1) for i in range(len(tasks)))
         busy: dict[Any, tuple[Any, int, int]] = {}
-        unlucky = 0
         while waiting or busy:
-            missing = min(self.count - len(busy), len(waiting)) - len(self.idle)
-            if missing > 0:
-                unlucky = 0 if self._hire(missing) or busy else unlucky + 1
-                if unlucky > ATTEMPTS:
-                    raise InputError(
-                        f"{_where(self.address)}: no worker stays alive; `ray status` may say why"
-                    )
-            while waiting and self.idle and len(busy) < self.count:
+            wanted = min(self.count - len(busy), len(waiting)) - len(self.idle) - len(self.called)
+            for worker in [self.actor.remote() for _ in range(wanted)]:
+                self.called[worker.node.remote()] = worker
+            while waiting and self.idle:
                 i, attempt = waiting.popleft()
                 worker = self.idle.pop()
                 busy[worker.shard.remote(tasks[i])] = worker, i, attempt
-            for done in self.api.wait(list(busy), num_returns=1)[0] if busy else []:
+            for done in self.api.wait([*busy, *self.called], num_returns=1)[0]:
+                if done in self.called:
+                    self._begin(done, alone=not busy)
+                    continue
                 worker, i, attempt = busy.pop(done)
                 try:
                     document, used = self.api.get(done)
                 except self.api.exceptions.RayTaskError as error:
-                    said = " ".join(str(error.cause).split())[:200]
-                    raise InputError(f"{_where(self.address)}: a worker cannot begin ({said})") from None
+                    raise InputError(
+                        f"{_where(self.address)}: a worker cannot work ({_said(error)})"
+                    ) from None
                 except self.api.exceptions.RayError as error:
                     self._dismiss(worker)
                     if attempt < ATTEMPTS:
@@ -133,28 +140,31 @@ class _Crew:
                     self.idle.append(worker)
                 yield i, document
 
-    def _hire(self, count: int) -> int:
-        """So many workers more, each with a core of its own while there are enough; how many of them live."""
-        new = [self.actor.remote() for _ in range(count)]
-        asked = [worker.node.remote() for worker in new]
-        hired = 0
-        for worker, where in zip(new, asked, strict=True):
-            try:
-                node = self.api.get(where)
-            except self.api.exceptions.RayActorError:
-                continue
-            taken = {place for at, place in self.places.values() if at == node}
-            place = min(set(range(len(taken) + 1)) - taken)
-            self.places[worker] = node, place
-            worker.settle.remote(place)
-            self.idle.append(worker)
-            hired += 1
-        return hired
+    def _begin(self, where: Any, *, alone: bool) -> None:
+        """Give a worker that was called a core of its own, while there are enough on its machine."""
+        worker = self.called.pop(where)
+        try:
+            node = self.api.get(where)
+        except self.api.exceptions.RayError as error:
+            self.stillborn += 1
+            if alone and self.stillborn > ATTEMPTS * self.count:
+                raise InputError(f"{_where(self.address)}: no worker begins ({_said(error)})") from None
+            return
+        self.stillborn = 0
+        taken = {place for at, place in self.places.values() if at == node}
+        place = min(set(range(len(taken) + 1)) - taken)
+        self.places[worker] = node, place
+        worker.settle.remote(place)
+        self.idle.append(worker)
 
     def _dismiss(self, worker: Any) -> None:
         """End a worker, if it has not ended."""
         self.places.pop(worker, None)
         self.api.kill(worker)
+
+
+def _said(error: Exception) -> str:
+    return " ".join(str(error).split())[-300:]
 
 
 def _lost(task: Task, error: Exception) -> str:

@@ -125,16 +125,15 @@ def _errors(found: Diagnosis) -> list[Estimate]:
     count as tell of their mean square.
     """
     problem, out = found.problem, []
-    held = [
-        (np.where(counts[:, None], r, 0.0), np.where(counts[:, None], e, 0.0), t)
-        for r, (e, counts), t, on in zip(
-            problem.residual, found.held_out, problem.traces, problem.active, strict=True
-        )
-        if on
-    ]
-    moved = np.any([t.trust.any(0) for _, _, t in held], 0)
-    for k, name in enumerate(("error_of_model", "held_out_error")):
-        errors = np.concatenate([part[k] for part in held])
+    before, after = [], []
+    for r, (e, counts), on in zip(problem.residual, found.held_out, problem.active, strict=True):
+        if on:
+            before.append(np.where(counts[:, None], r, 0.0))
+            after.append(np.where(counts[:, None], e, 0.0))
+    active = [t for t, on in zip(problem.traces, problem.active, strict=True) if on]
+    moved = np.any([t.trust.any(0) for t in active], 0)
+    for name, parts in (("error_of_model", before), ("held_out_error", after)):
+        errors = np.concatenate(parts)
         count = independent(errors)
         rms = np.sqrt(np.sum(errors**2, 0) / max(np.count_nonzero(np.any(errors, 1)), 1))
         for j in np.flatnonzero(moved & (rms > 0) & (count >= 1)):
