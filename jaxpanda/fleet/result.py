@@ -83,9 +83,10 @@ class Fleet:
         if h is None:
             return out
         if q.for_good:
+            differ = f"by {number(h.between, 2)} beside" if h.between else "no more than by"
             out.append(
                 f"{q.title}: {_pm(h.mean.value, h.mean.std)} {q.unit} beyond the model, for good"
-                f" ({h.count} recordings, which differ by {number(h.between, 2)} beside their deviations)"
+                f" ({h.count} recordings, which differ {differ} their deviations)"
             )
         if q.drifts and h.drift is not None:
             per = f"{q.unit} a {self.time_unit}" if self.time_unit else f"{q.unit} a unit of time"
