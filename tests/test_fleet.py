@@ -415,7 +415,7 @@ def test_levels_of_every_recording_are_the_truth_within_their_deviations(moving)
 
 
 @pytest.mark.slow
-def test_ray_s_workers_make_the_same_bits_though_one_is_killed(moving, tmp_path, monkeypatch):
+def test_ray_s_workers_make_the_same_bits_though_one_is_killed(moving, tmp_path, monkeypatch, capsys):
     """Needs Ray, which the extra [fleet] brings."""
     ray = pytest.importorskip("ray", reason="the extra [fleet] is not installed")
     monkeypatch.setenv("JAXPANDA_CACHE", str(tmp_path / "cache"))
@@ -436,6 +436,7 @@ def test_ray_s_workers_make_the_same_bits_though_one_is_killed(moving, tmp_path,
     assert len(killed) == 1
     assert found.made == 3
     assert not ray.is_initialized()
+    assert capsys.readouterr().out == ""  # Ray tells of the dead there
     here = moving / "here"
     diagnose_fleet(moving / "fleet.csv", here, model=moving / "arm.xml")
     assert {name: (out / name).read_bytes() for name in SET} == {

@@ -8,6 +8,7 @@ or with its machine, costs the recording that it was at, which another takes ove
 import contextlib
 import functools
 import importlib
+import io
 import os
 import signal
 import threading
@@ -194,11 +195,14 @@ def _cluster(workers: int | None, address: str | None) -> Iterator[tuple[Any, in
         except (ConnectionError, RuntimeError, ValueError) as error:
             said = " ".join(str(error).split())[:200]
             raise InputError(f"{_where(address)}: no cluster answers ({said})") from None
-    try:
-        yield api, workers or max(1, int(api.cluster_resources().get("CPU", 1)))
-    finally:
-        if not begun:
-            api.shutdown()
+    with contextlib.redirect_stdout(
+        io.StringIO()
+    ):  # where Ray tells of workers that died, and a result will be
+        try:
+            yield api, workers or max(1, int(api.cluster_resources().get("CPU", 1)))
+        finally:
+            if not begun:
+                api.shutdown()
 
 
 @contextlib.contextmanager

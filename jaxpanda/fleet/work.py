@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jaxpanda_kernels
 import mujoco
 import numpy as np
 
@@ -147,11 +148,12 @@ class Keys:
 
 
 def software() -> str:
-    """What computes: versions, and the sources of both packages but for what only tells of results."""
+    """What computes: versions, and the sources of both packages; of this one, not who computes or tells of it."""
     here = Path(__file__).parents[1]
-    kernels = Path(__import__("jaxpanda_kernels").__file__).parent
-    quiet = {"page.py", "result.py", "commands.py", "report.py", "summaries.py"}
-    sources = [p for root in (here, kernels) for p in sorted(root.rglob("*.py")) if p.name not in quiet]
+    kernels = Path(str(jaxpanda_kernels.__file__)).parent
+    own = {Path(__file__), Path(__file__).with_name("levels.py")}
+    every = [path for root in (here, kernels) for path in sorted(root.rglob("*.py"))]
+    sources = [path for path in every if path.parent != Path(__file__).parent or path in own]
     versions = [jax.__version__, mujoco.__version__, np.__version__]
     return " ".join([*versions, inputs.digest(*sources)])
 
