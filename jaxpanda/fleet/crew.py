@@ -17,6 +17,8 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import jax
+
 from .. import session
 from ..errors import InputError, MissingExtraError
 from ..files import to_json
@@ -84,7 +86,7 @@ class Worker:
         if hasattr(os, "sched_setaffinity"):
             cores = sorted(os.sched_getaffinity(0))
             os.sched_setaffinity(0, {cores[place % len(cores)]})
-        os.environ.setdefault("JAX_PLATFORMS", "cpu")
+        jax.config.update("jax_platforms", "cpu")  # as a diagnosis works there; a GPU is others'
         session.start()
 
     def shard(self, task: Task) -> tuple[str, int]:

@@ -78,7 +78,7 @@ def load_table(path: Path, model: Path | None) -> Table:
     try:
         lines = [
             (reader.line_num, cells)
-            for reader in [csv.reader(io.StringIO(text.lstrip()), delimiter=delimiter, strict=True)]
+            for reader in [csv.reader(io.StringIO(text), delimiter=delimiter, strict=True)]
             for cells in reader
             if any(cell.strip() for cell in cells)
         ]
