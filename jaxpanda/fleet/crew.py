@@ -182,6 +182,8 @@ def _where(address: str | None) -> str:
 @contextlib.contextmanager
 def _cluster(workers: int | None, address: str | None) -> Iterator[tuple[Any, int]]:
     """Ray, connected, and how many workers there are to be."""
+    if address:  # Ray would tell of every second that it waits for an answer
+        os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
     api = ray()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "CRITICAL"}
@@ -196,7 +198,8 @@ def _cluster(workers: int | None, address: str | None) -> Iterator[tuple[Any, in
                 api.init(address=address or "local", **quiet, **({} if address else here))
         except (ConnectionError, RuntimeError, ValueError) as error:
             said = " ".join(str(error).split())[:200]
-            raise InputError(f"{_where(address)}: no cluster answers ({said})") from None
+            token = "; one that asks for a token takes it from RAY_AUTH_TOKEN" if address else ""
+            raise InputError(f"{_where(address)}: no cluster answers ({said}){token}") from None
     with contextlib.redirect_stdout(
         io.StringIO()
     ):  # where Ray tells of workers that died, and a result will be
