@@ -5,6 +5,7 @@ import json
 import os
 import re
 import signal
+import socket
 import types
 from collections import Counter
 from pathlib import Path
@@ -333,6 +334,19 @@ def test_bad_usage_is_one_sentence(resting, tmp_path, capsys, given, said):
     assert said in err
     assert err.count("\n") == 1
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("address", ["nowhere", "127.0.0.1:port", "127.0.0.1:99999"])
+def test_an_address_where_nobody_is_is_one_sentence(address):
+    with pytest.raises(InputError, match=f"--address {address}: no cluster answers"):
+        crew._require_answer(address)
+
+
+def test_an_address_where_nobody_listens_is_one_sentence():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # and does not listen
+        with pytest.raises(InputError, match="no cluster answers"):
+            crew._require_answer(f"127.0.0.1:{taken.getsockname()[1]}")
 
 
 def test_without_ray_one_sentence_says_what_to_install(resting, tmp_path, capsys, monkeypatch):

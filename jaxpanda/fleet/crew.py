@@ -11,6 +11,7 @@ import importlib
 import io
 import os
 import signal
+import socket
 import threading
 import warnings
 from collections import deque
@@ -27,6 +28,8 @@ from .work import LOST, Task
 
 ATTEMPTS = 3
 """Workers that a recording may take with it before it is left alone."""
+_ANSWER = 20.0
+"""How long a cluster may take to answer [s]."""
 _STORE = 100_000_000
 """Bytes of Ray's store of objects; no more than sentences and numbers go through it."""
 
@@ -182,8 +185,9 @@ def _where(address: str | None) -> str:
 @contextlib.contextmanager
 def _cluster(workers: int | None, address: str | None) -> Iterator[tuple[Any, int]]:
     """Ray, connected, and how many workers there are to be."""
-    if address:  # Ray would tell of every second that it waits for an answer
+    if address:  # Ray would tell of every second that it waits for an answer, and wait for minutes
         os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
+        _require_answer(address)
     api = ray()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "CRITICAL"}
@@ -208,6 +212,19 @@ def _cluster(workers: int | None, address: str | None) -> Iterator[tuple[Any, in
         finally:
             if not begun:
                 api.shutdown()
+
+
+def _require_answer(address: str) -> None:
+    """Refuse an address of the form host:port where nothing listens."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if address == "auto" or "://" in address.removeprefix("ray://"):
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), _ANSWER).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError(
+            f"{_where(address)}: no cluster answers ({error}); HOST:PORT is needed, or auto"
+        ) from None
 
 
 @contextlib.contextmanager
