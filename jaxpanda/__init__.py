@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .errors import InputError as InputError
     from .excitation import excite as excite
     from .feasible import Bounds as Bounds
+    from .fleet import diagnose_fleet as diagnose_fleet
     from .identification import Identification as Identification
     from .identification import identify as identify
     from .identification import identify_mass_gravity as identify_mass_gravity
@@ -53,6 +54,7 @@ _HOME = {
     "Retrieval": "retrieval",
     "demonstrate": "demo",
     "diagnose": "diagnosis",
+    "diagnose_fleet": "fleet",
     "estimate_payload": "payload",
     "excite": "excitation",
     "predict": "diagnosis",

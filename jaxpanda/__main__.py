@@ -411,6 +411,45 @@ class Excite:
         )
 
 
+@dataclasses.dataclass(frozen=True)
+class Fleet:
+    """Many recordings of many arms: each diagnosed, and each arm's together: for good, drifting, once."""
+
+    table: tyro.conf.Positional[Path]
+    """CSV with a row a recording: recording, and arm, model, time or day, reference (docs/files.md)."""
+    out: Path
+    """Folder for fleet.json, fleet.html, Parquet tables, and what is finished."""
+    model: Path | None = None
+    """The simulation as you have it (MJCF), of rows that name none; without it, the project's own Panda."""
+    knowledge: Literal["exact", "identified", "rough", "unknown"] = "identified"
+    """How well the numbers in the models are known."""
+    address: str = ""
+    """Of a Ray cluster, or auto for the one of this machine; without it, Ray is started here."""
+    workers: int | None = None
+    """Processes; without it as many as there are cores. 0 works in this process, without Ray."""
+    worker_memory: float = 3.0
+    """Beyond which a worker is replaced [GB]."""
+    read: _Read = dataclasses.field(default_factory=Reading)
+    convention: _Convention = PLAIN
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import fleet
+
+        return fleet.fleet_files(
+            self.out,
+            self.table,
+            model=self.model,
+            knowledge=self.knowledge,
+            reading=self.read,
+            convention=self.convention,
+            workers=self.workers,
+            address=self.address,
+            memory=self.worker_memory,
+        )
+
+
 _COMMANDS = (
     Demo,
     Inspect,
@@ -423,6 +462,7 @@ _COMMANDS = (
     Payload,
     Convert,
     Excite,
+    Fleet,
 )
 
 

@@ -436,5 +436,6 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "PayloadEstimate": payload,
     "Conversion": conversion,
     "Excitation": excitation,
+    "Fleet": lambda result: result.sections(),
     "Demonstration": lambda result: result.sections,
 }

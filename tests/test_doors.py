@@ -18,6 +18,7 @@ from jaxpanda.__main__ import main
 from jaxpanda.errors import InputError, OutputError
 from jaxpanda.excitation import result as excitation
 from jaxpanda.files import Kind, output_folder, write_json, write_text
+from jaxpanda.fleet import result as fleet
 from jaxpanda.identification import result as identification
 from jaxpanda.payload import result as payload
 from jaxpanda.recordings import save
@@ -267,6 +268,7 @@ def one_folder(tmp_path_factory) -> tuple[Path, list[list[str]]]:
 
 
 KINDS = [identification.KIND, retrieval.KIND, validation.KIND, corrected.KIND, payload.KIND, excitation.KIND]
+KINDS += [fleet.KIND]
 
 
 def without_run(folder: Path) -> None:

@@ -102,13 +102,13 @@ def likelier(a: tuple[Problem, State], b: tuple[Problem, State]) -> float:
     """
     drifts = any(t.effect.drifts for _, state in (a, b) for t in state.terms)
     left, other = (problem.mispredicted(state.design, spread=drifts) for problem, state in (a, b))
-    count = np.minimum(_independent(left), _independent(other))
+    count = np.minimum(independent(left), independent(other))
     power = [np.maximum(np.sum(x**2, 0), 1e-300) for x in (left, other)]
     foretold = float(np.sum(0.5 * count * np.log(power[0] / power[1])))
     return b[1].score - a[1].score + foretold
 
 
-def _independent(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
+def independent(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
     r"""How many samples tell of a mean square, $n / (1 + 2 \sum \rho_k^2)$ (Bartlett 1946), lags up to where the
     correlation has first changed its sign."""
     n = len(x)
