@@ -58,7 +58,7 @@ def _samples(columns: Sequence[Float[Array, " filled"]], shape: tuple[int, ...])
 
 
 def _bodies(
-    arm: Geometry, phi: Float[Array, "dof 10"], like: Float[Array, "*samples dof"]
+    arm: Geometry, phi: Float[Array, "dof 10"], like: Float[Array, "..."]
 ) -> list[list[Scalar]]:
     """Bodies that take the same torques, with floats for the zeros among their parameters."""
     T = columns.regrouping(arm)
