@@ -170,7 +170,7 @@ def agreement(samples: int = 64) -> dict[str, float]:
     return worst
 
 
-def on_gpu(batch: int, groups: list[int], rounds: int, with_mjx: bool) -> dict:
+def on_gpu(batch: int, groups: list[int], rounds: int, with_mjx: bool, save: Callable[[dict], None]) -> dict:
     """Rates a second on JAX's default device, beside the floor that copying sets."""
     import jax
     import jax.numpy as jnp
@@ -189,7 +189,7 @@ def on_gpu(batch: int, groups: list[int], rounds: int, with_mjx: bool) -> dict:
     def rate(name: str, f: Callable, *arguments, evaluations: int, words: int = 0, size: int = 4) -> None:
         row: dict = {"batch": evaluations}
         try:
-            run, row["first_call_s"] = contender(f, arguments, evaluations, 4)
+            run, row["first_call_s"] = contender(f, arguments, evaluations, 1 if evaluations > 2**22 else 4)
             wall = [run()[0] for _ in range(rounds)]
         except Exception as error:  # memory, or a compiler that gives up: said, and the rest goes on
             row["failed"] = str(error)[:300]
@@ -213,7 +213,12 @@ def on_gpu(batch: int, groups: list[int], rounds: int, with_mjx: bool) -> dict:
                 flush=True,
             )
         result["rows"][name] = row
+        save(result)
 
+    if with_mjx:
+        mjx_peer(rate, 64 if cpu else 65536)
+    if not groups:
+        return result
     words = min(2**28, max(2**16, 16 * batch))
     big = jnp.ones(words, jnp.float32)
     copy, _ = contender(jax.jit(lambda x: x + 1), (big,), 8 * words, 4)
@@ -253,8 +258,6 @@ def on_gpu(batch: int, groups: list[int], rounds: int, with_mjx: bool) -> dict:
     worst = [float(jnp.abs(a - b).max() / jnp.abs(b).max()) for a, b in zip(single, defined, strict=True)]
     result["error_float32"] = max(worst)
     print(f"largest error over largest entry: {max(worst):.1e} in float32, {result['error_float64']:.1e}")
-    if with_mjx:
-        mjx_peer(rate, 64 if cpu else 65536)
     return result
 
 
@@ -324,7 +327,7 @@ def main() -> None:
         "--gpu", action="store_true", help="measure JAX's default device in place of the processor"
     )
     parser.add_argument(
-        "--groups", type=int, nargs="+", default=[1, 2, 3, 5], help="on a GPU: numbers of programs"
+        "--groups", type=int, nargs="*", default=[1, 2, 3, 5], help="on a GPU: numbers of programs"
     )
     parser.add_argument("--mjx", action="store_true", help="on a GPU: mjx.inverse differentiated beside it")
     parser.add_argument("--out", type=Path, help="on a GPU: file for the figures (JSON)")
@@ -341,9 +344,13 @@ def main() -> None:
     result: dict = {"machine": machine(), "batch": args.batch, "rounds": args.rounds, "fusion": args.fusion}
     print(json.dumps(result, indent=1))
     if args.gpu:
-        result["gpu"] = on_gpu(args.batch, args.groups, args.rounds, args.mjx)
-        if args.out:
-            args.out.write_text(json.dumps(result, indent=1) + "\n")
+
+        def save(found: dict) -> None:
+            result["gpu"] = found
+            if args.out:
+                args.out.write_text(json.dumps(result, indent=1) + "\n")
+
+        save(on_gpu(args.batch, args.groups, args.rounds, args.mjx, save))
         return
     environment = os.environ | ({"XLA_FLAGS": FUSION} if args.fusion else {})
     with tempfile.TemporaryDirectory() as name:
