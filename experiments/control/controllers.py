@@ -1,4 +1,4 @@
-"""Three controllers of one form, u = feed-forward + K(t) (desired - measured state), from a `Corrected` arm alone.
+"""Three controllers of one form, u = feed-forward + K(t) (desired - measured state), from a `Corrected` arm.
 
 Copy what you need: `motion` is (q, qd, qdd) of your own trajectory, each [time, dof], and `corrected` what
 `jaxpanda.Corrected.load("why")` reads from a folder that `diagnose` wrote. In: units of SI, radians.
@@ -30,7 +30,7 @@ def computed_torque(corrected, motion, bandwidth=1.0):
 
 
 def linearised(corrected, motion, tau, dt):
-    """A, B of the state (q, qd) about the motion; damping is taken after the step, so that steep friction is stable."""
+    """A, B of the state (q, qd) about the motion; damping is taken after the step: steep friction stays stable."""
 
     def one(q, qd, u):
         f_q, f_v, f_u = jax.jacfwd(corrected.forward_dynamics, (0, 1, 2))(q, qd, u)
@@ -55,10 +55,11 @@ def lqr(corrected, motion, tau, dt, state_scale, torque_scale):
 
 
 def tuned(corrected, motion, tau, dt, first, disturbance, torque_scale, knots=3, iterations=20):
-    """Gains of `first` times a schedule, tuned by the gradient of roll-outs through the corrected forward dynamics.
+    """Gains of `first` times a schedule, tuned by the gradient of roll-outs through the forward dynamics.
 
-    The arm starts off the motion, and a torque that nobody models pushes it: rows of `disturbance` [case, 3 dof] are
-    position, velocity and torque. What counts is the tracking error, and the feedback's torque beside `torque_scale`.
+    The arm starts off the motion, and a torque that nobody models pushes it: rows of `disturbance` [case, 3 dof]
+    are position, velocity and torque. What counts is the tracking error, and the feedback's torque beside
+    `torque_scale`.
     """
     plant, dof = corrected.plant(), motion[0].shape[1]
     memory = corrected.start(motion[0][0], motion[1][0])

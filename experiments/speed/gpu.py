@@ -226,7 +226,8 @@ def main() -> None:
             options |= {"limit": 5, "steps_of_gradient": 10}
         derivatives = [str(BENCHMARKS / "derivatives.py"), "--gpu", "--rounds", rounds]
         parts = {
-            "derivatives": ([*derivatives, "--batch", str(batch), "--groups", *groups, "--out", str(figures)], 0.45),
+            "derivatives": ([*derivatives, "--batch", str(batch), "--groups", *groups,
+                             "--out", str(figures)], 0.45),
             "rnea": ([str(BENCHMARKS / "rnea.py"), "--batch", str(batch), "--rounds", rounds,
                       "--child", "0", folder], 0.2),
             "ensemble": ([__file__, "--out", str(args.out), "--ensemble", json.dumps(options)], 0.5),
