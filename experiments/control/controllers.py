@@ -30,7 +30,7 @@ def computed_torque(corrected, motion, bandwidth=1.0):
 
 
 def linearised(corrected, motion, tau, dt):
-    """A, B of the state (q, qd) about the motion; damping is taken after the step: steep friction stays stable."""
+    """A, B of the state (q, qd) about the motion; implicit in damping, so that friction is stable."""
 
     def one(q, qd, u):
         f_q, f_v, f_u = jax.jacfwd(corrected.forward_dynamics, (0, 1, 2))(q, qd, u)

@@ -92,8 +92,9 @@ def on_processor(batch: int, note: Callable[[str, float], None], peers: bool) ->
         q, qd, last = states(batch, dtype)
         lists = [[jnp.array(x[:, i]) for i in range(7)] for x in (q, qd, last)]
         add(f"inverse, columns, {kind}", functools.partial(derivatives.entries, geometry, phi), *lists)
-        forward = functools.partial(derivatives.forward_entries, geometry, phi)
-        add(f"forward, columns, {kind}", lambda *x, f=forward: f(*x, zero), *lists)
+        if peers or dtype == jnp.float64:
+            forward = functools.partial(derivatives.forward_entries, geometry, phi)
+            add(f"forward, columns, {kind}", lambda *x, f=forward: f(*x, zero), *lists)
         if peers:
             few = min(batch, 2048)
             shape = functools.partial(derivatives.inverse, geometry, phi)
@@ -318,6 +319,9 @@ def main() -> None:
     )
     parser.add_argument("--batch", type=int, default=102_400, help="samples a call")
     parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument(
+        "--cores", type=int, nargs="+", default=[1, 2], help="a process for each number of cores"
+    )
     parser.add_argument("--fusion", action="store_true", help=f"with XLA_FLAGS={FUSION}")
     parser.add_argument(
         "--gpu", action="store_true", help="measure JAX's default device in place of the processor"
@@ -351,7 +355,7 @@ def main() -> None:
     environment = os.environ | ({"XLA_FLAGS": FUSION} if args.fusion else {})
     with tempfile.TemporaryDirectory() as name:
         reason = build_pinocchio(Path(name), args.include)
-        for cores in [1, 2] if result["machine"]["cores"] > 1 else [1]:
+        for cores in args.cores:
             command = [sys.executable, __file__, "--child", str(cores), name]
             command += ["--batch", str(args.batch), "--rounds", str(args.rounds)]
             done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=environment)
