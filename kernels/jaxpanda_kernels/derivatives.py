@@ -24,7 +24,7 @@ References:
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -345,7 +345,7 @@ def accelerations(
     tau: Columns,
     armature: Sequence[Scalar],
     stage: Stage = _here,
-) -> tuple[list[list[Scalar]], list[Scalar]]:
+) -> tuple[Sequence[Sequence[Scalar]], Sequence[Scalar]]:
     r"""The inverse of the mass matrix with armature, and the acceleration; arguments as in `of_columns`."""
     M = stage(functools.partial(columns.mass_matrix, arm), bodies, list(q))
     h = stage(lambda b, x, v: columns.rnea(arm, b, x, v, [0.0] * arm.dof), bodies, list(q), list(qd))
@@ -361,7 +361,7 @@ def _product(A: Sequence[Sequence[Scalar]], x: Sequence[Scalar]) -> list[Scalar]
 
 
 def through(
-    inverse: Sequence[Sequence[Scalar]], torque: dict[Pair, Scalar], what: str, stage: Stage = _here
+    inverse: Sequence[Sequence[Scalar]], torque: Mapping[Pair, Scalar], what: str, stage: Stage = _here
 ) -> dict[Pair, Scalar]:
     r"""$-M^{-1}\,\partial\tau$, the change of acceleration in one of "q" and "qd", less columns of zeros."""
     dof = range(len(inverse))
@@ -554,5 +554,6 @@ def forward(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _forward(arm: Geometry, phi, q, qd, tau, armature):
-    found = forward_entries(arm, phi, *map(batched._columns, (q, qd, tau)), armature)
+    angles, speeds, torques = map(batched._columns, (q, qd, tau))
+    found = forward_entries(arm, phi, angles, speeds, torques, armature)
     return Forward(*(_matrices(found, what, q) for what in Forward._fields))
