@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 import jaxpanda
+from jaxpanda import session
 from jaxpanda.export import panda_mjcf
 from jaxpanda.simulation import JointFriction, panda_sensors, perturbed, random_trajectory, simulate
 
@@ -109,18 +110,23 @@ def one_arm(seed: int, iterations: int) -> dict:
     )
     scale = jnp.concatenate([jnp.full(7, 0.01), jnp.full(7, 0.1)])
     rows: dict = {}
+
+    def follow(name, controller, ahead, K):
+        errors = track(model, motion, np.asarray(ahead), held(K))
+        rows.setdefault(controller, {})[name] = 1e3 * float(np.sqrt(np.mean(errors**2)))
+        print(f"  {name}, {controller}: {rows[controller][name]:.2f} mrad", flush=True)
+
     for name, corrected in (("before", nominal), ("after", found.corrected)):
         ahead = controllers.feed_forward(corrected, motion)
         first = controllers.computed_torque(corrected, coarse)
         regulator = controllers.lqr(corrected, coarse, ahead[::COARSE], dt, scale, jnp.asarray(TORQUE))
+        follow(name, "computed torque", ahead, first)
+        follow(name, "LQR", ahead, regulator)
         schedule, history = controllers.tuned(
             corrected, coarse, ahead[::COARSE], dt, first, off, jnp.asarray(TORQUE), iterations=iterations
         )
-        for controller, K in (("computed torque", first), ("LQR", regulator), ("tuned schedule", schedule)):
-            errors = track(model, motion, np.asarray(ahead), held(K))
-            rows.setdefault(controller, {})[name] = 1e3 * float(np.sqrt(np.mean(errors**2)))
+        follow(name, "tuned schedule", ahead, schedule)
         rows.setdefault("cost of tuning, first and last", {})[name] = [history[0], history[-1]]
-        print(f"  {name}: " + ", ".join(f"{c} {r[name]}" for c, r in rows.items()), flush=True)
     return {
         "seed": seed,
         "truth": truth,
@@ -140,7 +146,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=20, help="of the gradient on the gains")
     parser.add_argument("--out", type=Path, help="figures (JSON)")
     args = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
+    session.start()  # float64, and what is compiled is kept
     versions = {name: metadata.version(name) for name in ("jax", "mujoco", "numpy")}
     arms = [one_arm(args.seed + k, args.iterations) for k in range(args.arms)]
     summary = {}
