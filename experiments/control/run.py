@@ -12,7 +12,6 @@ from importlib import metadata
 from pathlib import Path
 
 import controllers
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
