@@ -23,7 +23,7 @@ def masses(corrected, q):
     )
 
 
-def computed_torque(corrected, motion, bandwidth=1.0):
+def computed_torque(corrected, motion, bandwidth=5.0):
     """Feedback as an acceleration, critically damped at `bandwidth` [Hz]: K of [time, dof, 2 dof]."""
     M, w = masses(corrected, motion[0]), 2 * jnp.pi * bandwidth
     return jnp.concatenate([w**2 * M, 2 * w * M], -1)
@@ -92,6 +92,8 @@ def tuned(corrected, motion, tau, dt, first, disturbance, torque_scale, knots=3,
     schedule, m, v, history = jnp.zeros((knots, 2 * dof)), 0.0, 0.0, []
     for k in range(1, iterations + 1):  # Adam
         value, g = cost(schedule)
+        if not (jnp.isfinite(value) and jnp.isfinite(g).all()):
+            raise FloatingPointError("a roll-out ran away: start from stiffer gains or weaker disturbances")
         history.append(float(value))
         m, v = 0.9 * m + 0.1 * g, 0.99 * v + 0.01 * g**2
         schedule = schedule - 0.1 * (m / (1 - 0.9**k)) / (jnp.sqrt(v / (1 - 0.99**k)) + 1e-9)
