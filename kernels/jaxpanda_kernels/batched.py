@@ -57,9 +57,7 @@ def _samples(columns: Sequence[Float[Array, " filled"]], shape: tuple[int, ...])
     return jnp.stack([c[:count] for c in columns], -1).reshape(shape)
 
 
-def _bodies(
-    arm: Geometry, phi: Float[Array, "dof 10"], like: Float[Array, "*samples dof"]
-) -> list[list[Scalar]]:
+def _bodies(arm: Geometry, phi: Float[Array, "dof 10"], like: Float[Array, "..."]) -> list[list[Scalar]]:
     """Bodies that take the same torques, with floats for the zeros among their parameters."""
     T = columns.regrouping(arm)
     regrouped = jnp.matmul(T, phi.reshape(-1), precision=lax.Precision.HIGHEST).astype(like.dtype)

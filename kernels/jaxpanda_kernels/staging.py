@@ -1,7 +1,7 @@
 """Parts of a program that XLA is kept from fusing with what consumes them."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +22,70 @@ def alone(f: Callable[..., T], *arguments: Any) -> T:
     Reverse mode keeps the arguments and computes `f` again, where it would otherwise keep each intermediate.
     Python floats, in and out, stay floats.
     """
+    compute, values, restore = _of_arrays(f, arguments)
+    compute = jax.checkpoint(compute)
+
+    def looped(*values: jax.Array) -> list[jax.Array]:
+        def round(carry, now):
+            return lax.cond(now, lambda _: compute(*values), lambda same: same, carry), None
+
+        empty = [jnp.zeros(s.shape, s.dtype) for s in jax.eval_shape(compute, *values)]
+        return lax.scan(round, empty, jnp.array([False, True]))[0]
+
+    def fenced(*values: jax.Array) -> list[jax.Array]:
+        return lax.optimization_barrier(compute(*values))
+
+    return restore(lax.platform_dependent(*values, cpu=looped, default=fenced))
+
+
+Stage: TypeAlias = Callable[..., Any]
+"""Calls its first argument with the rest, as `alone` does."""
+
+
+def in_chunks(f: Callable[..., T], size: int, *columns: Any) -> T:
+    """`f(stage, *columns)` for `size` samples at a time: what its stages hand on stays in the cache.
+
+    For programs with so many results that on a CPU, where no loop has several, most of the arithmetic would be
+    done again for each. Cut into stages, by `stage(g, ...)` in place of `g(...)`, it is done about once. Within
+    the loop over chunks a stage is a branch that is always taken, cheaper than the loop that `alone` needs.
+
+    Args:
+        f: gives arrays with as many samples as its arguments.
+        size: number of samples a chunk, which must divide theirs.
+        columns: trees of arrays (samples,).
+    """
+
+    def chunk(now: jax.Array, values: Any) -> Any:
+        def stage(g: Callable[..., Any], *arguments: Any) -> Any:
+            compute, arrays, restore = _of_arrays(g, arguments)
+            shapes = jax.eval_shape(compute, *arrays)
+
+            def nothing(*_: jax.Array) -> list[jax.Array]:
+                return [jnp.zeros(s.shape, s.dtype) for s in shapes]
+
+            return restore(lax.cond(now, compute, nothing, *arrays))
+
+        return f(stage, *values)
+
+    chunks = jax.tree.map(lambda x: x.reshape(-1, size), columns)
+    always = jnp.ones(len(jax.tree.leaves(chunks)[0]), bool)  # read in the loop: XLA does not know them there
+    results = lax.scan(lambda _, x: (None, chunk(*x)), None, (always, chunks))[1]
+    return jax.tree.map(lambda x: x.reshape(-1), results)
+
+
+def _of_arrays(
+    f: Callable[..., Any], arguments: tuple
+) -> tuple[Callable[..., list[jax.Array]], list[jax.Array], Callable[[list[jax.Array]], Any]]:
+    """`f` as a function of the arrays among its arguments, those arrays, and what makes results of its arrays.
+
+    Python floats, in and out, stay floats.
+    """
     leaves, structure = jax.tree.flatten(arguments)
     places = [i for i, leaf in enumerate(leaves) if not isinstance(leaf, float)]
     folded: list[Any] = []
 
     @jax.jit  # traced once, though it is looked at several times
-    def arrays(*values: jax.Array) -> list[jax.Array]:
+    def compute(*values: jax.Array) -> list[jax.Array]:
         filled = list(leaves)
         for i, value in zip(places, values, strict=True):
             filled[i] = value
@@ -35,19 +93,9 @@ def alone(f: Callable[..., T], *arguments: Any) -> T:
         folded[:] = [results_structure, [r if isinstance(r, float) else None for r in results]]
         return [r for r in results if not isinstance(r, float)]
 
-    compute = jax.checkpoint(arrays)
+    def restore(arrays: list[jax.Array]) -> Any:
+        results = iter(arrays)
+        results_structure, known = folded
+        return jax.tree.unflatten(results_structure, [next(results) if k is None else k for k in known])
 
-    def looped(*values: jax.Array) -> list[jax.Array]:
-        def round(carry, now):
-            return lax.cond(now, lambda _: compute(*values), lambda same: same, carry), None
-
-        empty = [jnp.zeros(s.shape, s.dtype) for s in jax.eval_shape(arrays, *values)]
-        return lax.scan(round, empty, jnp.array([False, True]))[0]
-
-    def fenced(*values: jax.Array) -> list[jax.Array]:
-        return lax.optimization_barrier(compute(*values))
-
-    values = [leaves[i] for i in places]
-    results = iter(lax.platform_dependent(*values, cpu=looped, default=fenced))
-    results_structure, known = folded
-    return jax.tree.unflatten(results_structure, [next(results) if k is None else k for k in known])
+    return compute, [leaves[i] for i in places], restore
