@@ -29,6 +29,7 @@ from .identification import Identification
 from .identification.condensed import Evidence, least_friction, own_parameters, with_own_parameters
 from .identification.result import known_physics
 from .inputs import read_json, read_npz
+from .model_file import WHOLE, Part
 from .panda import panda
 from .parameters import coefficient_matrix
 
@@ -85,6 +86,8 @@ class Retrieval:
     """What the model that was identified held beyond rigid links; carried along too."""
     model_file: str = ""
     """The MJCF that was identified, where that is known."""
+    model_part: Part = WHOLE
+    """Which arm of that file it is."""
     rmse: Float[np.ndarray, " dof"] | None = None
     """What these links and this friction leave of the torque that they were identified from [N m]."""
     relative_error_percent: float | None = None
@@ -132,6 +135,7 @@ class Retrieval:
             "spread": {name: list(pair) for name, pair in self.spread.items()},
             "weighting": self.weighting,
             "model_file": self.model_file or None,
+            "model_part": self.model_part.to_json(),
             "rmse": [] if self.rmse is None else self.rmse.tolist(),
             "relative_error_percent": self.relative_error_percent,
             "cross_validated_rmse": (
@@ -187,6 +191,7 @@ class Retrieval:
                 friction=Friction.from_json(document["friction"]) if document["friction"] else None,
                 known=known_physics(document["known"], len(document["links"]), str(file)),
                 model_file=document.get("model_file") or "",
+                model_part=Part.from_json(document.get("model_part")),
                 rmse=_array(document.get("rmse")),
                 relative_error_percent=document.get("relative_error_percent"),
                 cross_validated_rmse=_array(document.get("cross_validated_rmse")),
@@ -334,6 +339,7 @@ def retrieve(
         friction=friction,
         known=table.known,
         model_file=table.model_file,
+        model_part=table.model_part,
         **errors,
         warnings=tuple(doubts(phi, names, None if arm is None else reach(arm))),
         notes=tuple(notes),

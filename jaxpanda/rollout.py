@@ -48,6 +48,7 @@ from .mjcf import (
     own_log,
     standard_from_com,
 )
+from .model_file import Model
 from .recordings import Recording
 from .recordings import load as load_recording
 from .signals import derivatives, prepare, zero_phase
@@ -129,7 +130,7 @@ def replay(
     diagnosis: str | Path | Corrected,
     recording: str | Path | Recording,
     *,
-    model: str | Path | MjcfSource | None = None,
+    model: Model | MjcfSource | None = None,
     engine: Engine = "mujoco",
     seconds: float = SECONDS,
     start: float | None = None,
@@ -200,7 +201,7 @@ def compare(
 
 
 def compare_files(
-    diagnosis: str | Path, model: str | Path, recording: str | Path, *, seconds: float = SECONDS
+    diagnosis: str | Path, model: Model, recording: str | Path, *, seconds: float = SECONDS
 ) -> dict[str, Any]:
     """`compare`, from the folder that `diagnose` wrote, the user's MJCF and a recording."""
     corrected, source = _opened(diagnosis, model)
@@ -326,7 +327,7 @@ def stable(gains: Gains, recording: Recording, arm: Arm, dt: float) -> Gains:
 
 def _opened(
     diagnosis: str | Path | Corrected,
-    model: str | Path | MjcfSource | None,
+    model: Model | MjcfSource | None,
     effects: Sequence[type[AbstractEffect]] = (),
 ) -> tuple[Corrected, MjcfSource]:
     if isinstance(diagnosis, Corrected):
