@@ -179,7 +179,7 @@ def write_parameters(
             if not _agree(target, meant[i], np.asarray(standard)):
                 if not np.any(meant[i]):
                     raise InputError(
-                        f"{source.path}: link {link.body!r} stands between two joints of one body and has no mass,"
+                        f"{source.path}: link {link.body!r} stands between two joints of one body, without mass,"
                         " the parameters give it some; identify with this file as --model"
                     )
                 meant[i], edit = _inertial_edit(source, link, bodies[i], target, warnings)

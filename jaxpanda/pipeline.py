@@ -266,9 +266,10 @@ def _to_mjcf(links: Retrieval, out: Path, model: Model | None) -> Export:
 def _identified_file(links: Retrieval) -> ModelFile | None:
     """The MJCF to export into where none is given; None for the project's own Panda."""
     if not links.model_file:
-        if links.arm not in ("", "panda"):
+        if not links.own:
             raise InputError(
-                f"export: the links are those of the arm '{links.arm}'; give its MJCF by --model"
+                f"export: the links are those of the arm '{links.arm}', which is not the project's own Panda;"
+                " give its MJCF by --model"
             )
         return None
     if not (model := Path(links.model_file)).is_file():
