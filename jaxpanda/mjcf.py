@@ -17,6 +17,7 @@ import dataclasses
 import difflib
 import warnings
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -29,7 +30,7 @@ from . import inputs, markup
 from .arm import KNOWN, Arm
 from .engine_log import own_log
 from .errors import InputError
-from .model_file import Model, Part, part_of
+from .model_file import Model, ModelFile, Part, part_of
 from .urdf_in import as_mjcf
 
 FINGER_JOINTS = 4
@@ -185,6 +186,18 @@ def load_model(path: Model, *, balanceinertia: bool = False) -> mujoco.MjModel:
     _drop_looks(spec, document)
     spec.compiler.balanceinertia |= balanceinertia
     return _compile(spec, document.path)
+
+
+def file_with(arm: Arm, path: str | Path) -> ModelFile:
+    """A file that holds this arm, with what chooses the arm by the names of its joints."""
+    model = load_model(ModelFile(path, Part(outside=True)))
+    names = [model.joint(joint).name for joint in range(model.njnt)]
+    if not set(arm.joint_names) <= set(names):
+        return ModelFile(path)
+    first, last = (int(model.jnt_bodyid[names.index(arm.joint_names[i])]) for i in (0, -1))
+    base = int(model.body_parentid[first])
+    root, tip = (model.body(body).name for body in (base, last))
+    return ModelFile(path, Part(root if base else "", tip if root or not base else "", outside=True))
 
 
 @own_log()
@@ -429,19 +442,31 @@ def _arms(model: mujoco.MjModel) -> Iterator[tuple[str, int]]:
         if not _turns_or_slides(model, tip):
             continue
         bodies, beyond = [tip], _first_moving(model, tip)
-        while (parent := _moving_parent(model, bodies[-1])) and _turns_or_slides(model, parent):
-            if len(_first_moving(model, parent)) > 1:
+        if len(beyond) == 1:
+            continue
+        while True:
+            parent = _moving_parent(model, bodies[-1])
+            beside = [b for b in _first_moving(model, parent) if b != bodies[-1]] if parent else []
+            ends = not parent or not _turns_or_slides(model, parent)
+            if ends or beside:
+                yield from _options(model, bodies, beyond)
+            if ends or any(_depth(model, b) > FINGER_JOINTS for b in beside):
                 break
             bodies.append(parent)
-        joints = sum(int(model.body_jntnum[body]) for body in bodies)
-        if len(beyond) == 1 or any(_depth(model, b) > min(FINGER_JOINTS, joints - 1) for b in beyond):
-            continue
-        base = int(model.body_parentid[bodies[-1]])
-        names = model.body(base).name, model.body(tip).name
-        if base and names[0] and _first_moving(model, base) == bodies[-1:]:
-            yield f"--root {names[0]}", joints
-        elif all(names):
-            yield (f"--root {names[0]} " if base else "") + f"--tip {names[1]}", joints
+
+
+def _options(model: mujoco.MjModel, bodies: list[int], beyond: list[int]) -> Iterator[tuple[str, int]]:
+    """The options that choose these bodies, the last of the arm first, where they can be an arm."""
+    joints = sum(int(model.body_jntnum[body]) for body in bodies)
+    if any(_depth(model, branch) > min(FINGER_JOINTS, joints - 1) for branch in beyond):
+        return
+    base = int(model.body_parentid[bodies[-1]])
+    root, tip = model.body(base).name, model.body(bodies[0]).name
+    alone = all(_first_moving(model, body) == [other] for body, other in pairwise([base, *bodies[::-1]]))
+    if base and root and alone:
+        yield f"--root {root}", joints
+    elif root and tip:
+        yield (f"--root {root} " if base else "") + f"--tip {tip}", joints
 
 
 def _require_turns_or_slides(model: mujoco.MjModel, bodies: list[int], path: Path) -> None:
@@ -587,7 +612,8 @@ def _check_loops(model: mujoco.MjModel, joints: list[int], path: Path) -> None:
             closes = owner[a] != owner[b] and bool({owner[a], owner[b]} & bodies)
         else:
             closes = False
-        if closes and model.eq_active0[eq]:
+        held = kind in _TIES and max(model.body_mocapid[a], model.body_mocapid[b]) >= 0  # by the user's hand
+        if closes and model.eq_active0[eq] and not held:
             raise InputError(f"{path}: equality {name!r} closes a loop over the arm; a serial arm has none")
 
 
@@ -621,6 +647,8 @@ def _notes(model: mujoco.MjModel, joints: list[int], locked: list[int]) -> list[
         notes.append(f"joints {names}, on which the arm stands, are held at their reference")
     if loose := int(np.sum(owner < 0)) - sum(owner[body] < 0 for body in base):
         notes.append(f"{loose} loose bodies of the scene are no part of the arm")
+    if np.any(model.body_mocapid >= 0) and np.any(np.isin(model.eq_type, _TIES)):
+        notes.append("what ties the arm to a mocap body is ignored: it is a hand of the simulation")
     if np.any(model.body_gravcomp[owner > 0]):
         notes.append(
             "gravcomp is ignored: it is a force of the simulation; a measured torque carries the weight"

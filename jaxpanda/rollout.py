@@ -42,6 +42,7 @@ from .export import dry_friction
 from .mjcf import (
     MjcfSource,
     com_from_standard,
+    file_with,
     from_mjcf,
     has_own_friction_law,
     move_standard,
@@ -336,7 +337,7 @@ def _opened(
         corrected = diagnosis
     else:
         corrected = read(diagnosis, effects)[0]
-        model = Path(diagnosis) / XML if model is None else model
+        model = file_with(corrected.arm, Path(diagnosis) / XML) if model is None else model
     return corrected, model if isinstance(model, MjcfSource) else from_mjcf(model)[1]
 
 

@@ -12,7 +12,7 @@ from jaxpanda.__main__ import main
 from jaxpanda.errors import InputError
 from jaxpanda.export import write_parameters
 from jaxpanda.lint import lint
-from jaxpanda.mjcf import from_mjcf
+from jaxpanda.mjcf import file_with, from_mjcf
 from jaxpanda.model_file import ModelFile, Part
 from jaxpanda.urdf import to_urdf
 
@@ -93,6 +93,15 @@ def test_an_export_changes_the_chosen_arm_alone(tmp_path):
     heavier = np.asarray(arm.standard) * np.array([[1.0], [1.0], [1.1]])
     result = write_parameters(source, arm, heavier)
     assert {change.element for change in result.changes} == {"inertial of right/link3"}
+
+
+def test_a_chosen_arm_is_found_again_by_its_joints(tmp_path):
+    """`replay` reads corrected.xml, which says nothing of what was chosen."""
+    for text, part in ((TWO, Part(root="right/base")), (WHEELED, Part(root="a/base", tip="a/link2"))):
+        arm, _ = from_mjcf(ModelFile(written(tmp_path, text), part))
+        again, _ = from_mjcf(file_with(arm, tmp_path / "arm.xml"))
+        assert again.joint_names == arm.joint_names
+        np.testing.assert_array_equal(again.standard, arm.standard)
 
 
 # Several joints on one body
