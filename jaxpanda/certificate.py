@@ -70,9 +70,7 @@ def lower_bound(
         raise MissingExtraError("the certificate of optimality", "sdp") from None
     began = time.perf_counter()
     known, every = Known.of(bounds), bounds.dof
-    if (
-        not known.nothing
-    ):  # what is known is no unknown; boxes that are points are opened, which lowers the bound
+    if not known.nothing:  # what is known is no unknown; boxes that are points are opened, if anything
         b = b - A[:, : 10 * every] @ known.phi.ravel()
         unknown = np.repeat(np.isin(np.arange(every), known.free), 10)
         unknown = np.concatenate([unknown, np.ones(A.shape[1] - 10 * every, bool)])

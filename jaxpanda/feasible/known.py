@@ -1,8 +1,9 @@
 """What is known of links beforehand: boxes that are points, as numbers from CAD are.
 
-A link of which everything is known is no unknown: its columns go to the right-hand side. A box that is a point
-has no inside, which interior-point steps need: it is opened a little for them, and what they find is set to the
-known number afterwards.
+A link of which everything is known is no unknown: its columns go to the right-hand side. Masses and centres of
+mass that are known are held by `newton`'s projection. A box on inertias or on the total mass that is a point has
+no inside, which both solvers need: it is opened a little for them, and what they find is set to the known number
+afterwards.
 """
 
 import dataclasses
@@ -20,10 +21,13 @@ from .bounds import Bounds
 from .constraints import Constraint, Links
 from .outcome import XYZ_COLUMN, XYZ_MATRIX, XYZ_ROW, largest_violation, limits_of
 
-_OPENED = 4e-6
-"""Width of what was a point: [kg], [m], and as a share of a link's largest bound on inertia."""
-_CLOSED = 2e-6
-"""Width below which a box counts as a point, in the same units."""
+_OPENED = 1.2e-6
+"""Width of what was a point, as a share of a link's largest bound on inertia or four times the total mass."""
+_CLOSED = 1e-6
+"""Width below which a box is a point: [kg], [m], and as a share of a link's largest bound on inertia."""
+
+
+_SPHERE = np.array([0, 0, 0, 0, 1, 0, 1, 0, 0, 1.0])  # equal moments, in the order of phi
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,8 +45,7 @@ class Known:
 
     @classmethod
     def of(cls, bounds: Bounds) -> "Known":
-        largest = np.max(np.where(np.isfinite(bounds.inertia), np.abs(bounds.inertia), 0.0), (1, 2))
-        size = np.where(largest > 0, largest, 1.0)[:, None]
+        size = _size(bounds)[:, None]
         boxes = np.concatenate([bounds.mass[:, None], bounds.com, bounds.inertia / size[..., None]], 1)
         points = boxes[..., 1] - boxes[..., 0] <= _CLOSED
         nothing = bounds.mass[:, 1] == 0
@@ -68,18 +71,16 @@ class Known:
         return total is not None and bool(total[1] - total[0] <= _CLOSED)
 
     def reduced(self) -> Bounds:
-        """Of the links that are unknown, with no box that is a point."""
+        """Of the links that are unknown, with no box on inertia or the total mass that is a point."""
         bounds, free, points = self.bounds, self.free, self.points[self.free]
         total = bounds.total_mass
         if total is not None:
             total = total - np.delete(self.phi[:, 0], free).sum()
-            total = _open(total, np.asarray(self._total), 1.0)
-        largest = np.max(np.where(np.isfinite(bounds.inertia), np.abs(bounds.inertia), 0.0), (1, 2))[free]
-        unit = np.where(largest > 0, largest, 1.0)
-        mass = _open(bounds.mass[free], points[:, 0], 1.0)
+            total = _open(total, np.asarray(self._total), max(1.0, 4 * float(total[1])))
+        unit = _size(bounds)[free]
         return Bounds(
-            mass=np.maximum(mass, 0.0),
-            com=_open(bounds.com[free], points[:, 1:4], 1.0),
+            mass=bounds.mass[free],
+            com=bounds.com[free],
             inertia=_open(bounds.inertia[free], points[:, 4:], unit[:, None]),
             total_mass=total,
         )
@@ -91,18 +92,35 @@ class Known:
         return found
 
     def constraint(self, one: Constraint) -> Constraint:
-        """The same of the links that are unknown."""
+        """The same of the links that are unknown, with their known numbers as they are known."""
         whole, free = jnp.asarray(self.phi), jnp.asarray(self.free)
-        return lambda links: one(Links.from_phi(whole.at[free].set(links.phi)))
+        settle = partial(_settled, self.bounds, self.points, self.free, self.phi)
+        return lambda links: one(Links.from_phi(whole.at[free].set(settle(links.phi))))
+
+    def carried(self, given: Float[np.ndarray, "dof 10"] | None) -> Float[np.ndarray, "free 10"] | None:
+        """What the unknown links carry, a little more of it: known numbers that are set must not take it away."""
+        points = self.points[self.free]
+        carried = np.zeros((len(self.free), 10)) if given is None else given[self.free].copy()
+        some = points[:, 4:].any(1) & (carried.any(1) | ~points[:, 4:].all(1))
+        if given is None and not some.any():
+            return None
+        carried[some] += 2 * _OPENED * _size(self.bounds)[self.free][some, None] * _SPHERE
+        return carried
 
     def settled(
         self, phi: Float[np.ndarray, "starts free 10"], constraints: Sequence[Constraint]
     ) -> tuple[Float[np.ndarray, "starts dof 10"], Float[np.ndarray, " starts"]]:
         """All links of every start, known numbers as they are known, and by how much anything is missed."""
-        settle = jax.jit(jax.vmap(partial(_settled, self.bounds, self.points, self.free)))
+        settle = jax.jit(jax.vmap(partial(_settled, self.bounds, self.points, self.free, self.phi)))
         found = self.filled(np.asarray(settle(jnp.asarray(phi))))
         limits = limits_of(self.bounds, tuple(constraints))
         return found, np.asarray(jax.jit(jax.vmap(partial(largest_violation, limits)))(jnp.asarray(found)))
+
+
+def _size(bounds: Bounds) -> Float[np.ndarray, " dof"]:
+    """Largest bound on each link's inertia [kg m²]; one where it has none."""
+    largest = np.max(np.where(np.isfinite(bounds.inertia), np.abs(bounds.inertia), 0.0), (1, 2))
+    return np.where(largest > 0, largest, 1.0)
 
 
 def _open(box: np.ndarray, points: np.ndarray, unit: float | np.ndarray) -> np.ndarray:
@@ -114,18 +132,30 @@ def _open(box: np.ndarray, points: np.ndarray, unit: float | np.ndarray) -> np.n
 
 
 def _settled(
-    bounds: Bounds, points: np.ndarray, free: np.ndarray, phi: Float[Array, "free 10"]
+    bounds: Bounds,
+    points: np.ndarray,
+    free: np.ndarray,
+    whole: Float[np.ndarray, "dof 10"],
+    phi: Float[Array, "free 10"],
 ) -> Float[Array, "free 10"]:
+    """Known numbers set; a known total mass is met by the link whose mass is farthest from its bounds."""
     mass, com, I_com = jax.vmap(inertia.to_com)(phi)
     set_to = lambda value, box, known: jnp.where(known, jnp.clip(value, box[..., 0], box[..., 1]), value)
     known = points[free]
     six = set_to(I_com[:, XYZ_ROW, XYZ_COLUMN], bounds.inertia[free], known[:, 4:])
+    set_mass = set_to(mass, bounds.mass[free], known[:, 0])
+    total = bounds.total_mass
+    if total is not None and total[1] - total[0] <= _CLOSED and not known[:, 0].all():
+        slack = jnp.where(known[:, 0], -jnp.inf, jnp.min(jnp.abs(set_mass[:, None] - bounds.mass[free]), 1))
+        others = np.delete(whole[:, 0], free).sum()
+        set_mass = set_mass.at[jnp.argmax(slack)].add(total.mean() - others - jnp.sum(set_mass))
     settled = jax.vmap(inertia.from_com)(
-        set_to(mass, bounds.mass[free], known[:, 0]),
+        set_mass,
         set_to(com, bounds.com[free], known[:, 1:4]),
         six[:, XYZ_MATRIX],
     )
-    return jnp.where(known.any(1, keepdims=True), settled, phi)
+    moved = known.any(1) | (set_mass != mass)
+    return jnp.where(moved[:, None], settled, phi)
 
 
 def require_numbers(constraints: Sequence[Callable], bounds: Bounds) -> None:

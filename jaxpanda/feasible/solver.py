@@ -135,7 +135,7 @@ def solve(
             b - A[:, : 10 * bounds.dof] @ known.phi.ravel(),
             known.reduced(),
             tuple(known.constraint(one) for one in constraints),
-            None if carried is None else carried[known.free],
+            known.carried(carried),
             extra_lower,
             extra_upper,
             None if initial is None else initial[:, known.free],
