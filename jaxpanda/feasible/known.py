@@ -111,7 +111,10 @@ class Known:
         self, phi: Float[np.ndarray, "starts free 10"], constraints: Sequence[Constraint]
     ) -> tuple[Float[np.ndarray, "starts dof 10"], Float[np.ndarray, " starts"]]:
         """All links of every start, known numbers as they are known, and by how much anything is missed."""
-        settle = jax.jit(jax.vmap(partial(_settled, self.bounds, self.points, self.free, self.phi)))
+        if not len(self.free):
+            settle = lambda phi: phi
+        else:
+            settle = jax.jit(jax.vmap(partial(_settled, self.bounds, self.points, self.free, self.phi)))
         found = self.filled(np.asarray(settle(jnp.asarray(phi))))
         limits = limits_of(self.bounds, tuple(constraints))
         return found, np.asarray(jax.jit(jax.vmap(partial(largest_violation, limits)))(jnp.asarray(found)))

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.optimize import lsq_linear
 
 from ..errors import InputError, require_x64
 from . import convex, newton, projection, schedule
@@ -127,8 +128,10 @@ def solve(
     _require_room(bounds, carried)
     known = Known.of(bounds)
     if not known.nothing:
-        extra_box(A, b, bounds, extra_lower, extra_upper)
-        columns = np.concatenate([np.arange(10) + 10 * link for link in known.free] or [np.zeros(0, int)])
+        low, high = extra_box(A, b, bounds, extra_lower, extra_upper)
+        if not len(known.free):
+            return _all_known(A, b, known, low, high, constraints, starts)
+        columns = np.concatenate([np.arange(10) + 10 * link for link in known.free])
         further = np.arange(10 * bounds.dof, A.shape[1])
         found = _solve(
             A[:, np.concatenate([columns, further]).astype(int)],
@@ -174,6 +177,25 @@ def solve(
         checkpoint,
         progress,
     )
+
+
+def _all_known(
+    A: Float[np.ndarray, "rows columns"],
+    b: Float[np.ndarray, " rows"],
+    known: Known,
+    low: Float[np.ndarray, " extra"],
+    high: Float[np.ndarray, " extra"],
+    constraints: tuple[Constraint, ...],
+    starts: int,
+) -> Solutions:
+    """Every start is the links that are known; what is unknown beside them is linear."""
+    n, extra = 10 * known.bounds.dof, np.zeros(len(low))
+    if len(extra):
+        extra = lsq_linear(A[:, n:], b - A[:, :n] @ known.phi.ravel(), (low, high)).x
+    phi, violation = known.settled(np.zeros((starts, 0, 10)), constraints)
+    extra = np.tile(extra, (starts, 1))
+    none = np.zeros(starts, int)
+    return Solutions(phi, extra, _objectives(A, b, phi, extra), violation, violation == 0, none, 0.0, 0.0)
 
 
 def _require_room(bounds: Bounds, carried: Float[np.ndarray, "dof 10"] | None) -> None:
