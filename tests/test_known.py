@@ -66,8 +66,23 @@ KNOWN = {
 }
 
 
-@pytest.mark.parametrize("names", KNOWN.values(), ids=KNOWN.keys())
-def test_known_numbers_hold_exactly(names):
+QUICK = ("an inertia", "a link")
+
+
+@pytest.fixture(scope="module")
+def loose():
+    """Where nothing is known, and nothing carried."""
+    return solve(*equations(), WIDE, starts=4)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param(names, id=case, marks=[] if case in QUICK else [pytest.mark.slow])
+        for case, names in KNOWN.items()
+    ],
+)
+def test_known_numbers_hold_exactly(names, loose):
     """A division by zero, or "nearest misses by 5.7e-19"."""
     A, b = equations()
     bounds = with_points(names)
@@ -84,7 +99,6 @@ def test_known_numbers_hold_exactly(names):
     for (name, (value, _)), (_, (low, high)) in zip(got.boxes(), bounds.boxes(), strict=True):
         if low == high:
             np.testing.assert_allclose(value, low, rtol=1e-12, atol=1e-14, err_msg=name)
-    loose = solve(A, b, WIDE, starts=4)
     assert loose.objective[loose.best] <= found.objective[found.best] * (1 + 1e-4) + 1e-9
 
 
@@ -95,6 +109,7 @@ def test_everything_known_leaves_nothing_to_find():
     np.testing.assert_allclose(found.phi, np.stack([PHI, PHI]), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_link_without_mass_stays_one():
     A, b = equations()
     bounds = with_points(())
@@ -121,16 +136,9 @@ CARRIED = np.zeros((2, 10))
 CARRIED[1] = inertia.from_com(jnp.asarray(0.8), jnp.array([0.02, 0.01, 0.05]), 0.004 * jnp.eye(3))
 
 
-@pytest.fixture(scope="module")
-def carrying():
-    """Links that carry more than the coefficients have room for."""
-    A, b = equations()
-    return solve(A, b, WIDE, carried=CARRIED, starts=6), solve(A, b, WIDE, starts=6)
-
-
-def test_what_is_left_of_a_link_is_a_body_in_every_start(carrying):
+def test_what_is_left_of_a_link_is_a_body_in_every_start(loose):
     """Export was refused once the gripper was taken off."""
-    found, free = carrying
+    found, free = solve(*equations(), WIDE, carried=CARRIED, starts=4), loose
     assert np.all(found.violation == 0)
     assert all(are_buildable(phi[1:] - CARRIED[1:]) for phi in found.phi)
     assert not all(are_buildable(phi[1:] - CARRIED[1:]) for phi in free.phi)
