@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from .identification import identify as identify
     from .identification import identify_mass_gravity as identify_mass_gravity
     from .inspection import inspect as inspect
+    from .model_file import ModelFile as ModelFile
+    from .model_file import Part as Part
     from .payload import estimate_payload as estimate_payload
     from .pipeline import to_mjcf as to_mjcf
     from .reading import Reading as Reading
@@ -49,6 +51,8 @@ _HOME = {
     "Diagnosis": "diagnosis",
     "Identification": "identification",
     "InputError": "errors",
+    "ModelFile": "model_file",
+    "Part": "model_file",
     "Reading": "reading",
     "Recording": "recordings",
     "Retrieval": "retrieval",

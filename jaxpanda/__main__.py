@@ -25,6 +25,7 @@ import tyro
 
 from .convention import PLAIN, Convention
 from .errors import InputError, OutputError, printable
+from .model_file import WHOLE, Part
 from .reading import Reading
 
 # Before numpy is imported: its matrices are small here, and threads on them cost more than they save (a
@@ -35,6 +36,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _Read = Annotated[Reading, tyro.conf.arg(name="")]
 _Convention = Annotated[Convention, tyro.conf.arg(name="")]
 """Options of every command that reads recordings: which part of a log is read, then what its columns mean."""
+_Part = Annotated[Part, tyro.conf.arg(name="")]
+"""Options of every command that takes a model: which arm of it is meant."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,12 +49,13 @@ class Demo:
     recording: tuple[Path, ...] = ()
     """Recordings (any log that docs/files.md lists); without any, a virtual Panda is recorded."""
     model: Path | None = None
-    """The simulation as you have it (MJCF); without it, the project's own Panda."""
+    """The simulation as you have it (MJCF or URDF); without it, the project's own Panda."""
     starts: int = 2048
     """Random starts of the retrieval."""
     seed: int = 0
     read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
+    part: _Part = WHOLE
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -61,7 +65,7 @@ class Demo:
         return demonstrate(
             self.out,
             recordings=self.recording,
-            model=self.model,
+            model=self.part.of_any(self.model),
             starts=self.starts,
             seed=self.seed,
             reading=self.read,
@@ -76,16 +80,19 @@ class Inspect:
     recording: tuple[Path, ...]
     """Recordings to look at."""
     model: Path | None = None
-    """The arm (MJCF); without it, the project's own Panda."""
+    """The arm (MJCF or URDF); without it, the project's own Panda."""
     read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
+    part: _Part = WHOLE
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.inspect_files(self.recording, self.model, self.read, self.convention)
+        return pipeline.inspect_files(
+            self.recording, self.part.of_any(self.model), self.read, self.convention
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +106,7 @@ class Identify:
     mass_gravity: Path | None = None
     """Table of M(q), g(q) instead of recordings: .npz with q (N, n), M (N, n, n), g (N, n)."""
     model: Path | None = None
-    """The arm (MJCF); without it, the project's own Panda."""
+    """The arm (MJCF or URDF); without it, the project's own Panda."""
     method: Literal["trajectory", "one_step"] = "trajectory"
     """Classical least squares, or feasible parameters straight from torque."""
     friction: Literal["coulomb_viscous_offset", "coulomb_viscous", "viscous", "sigmoid", "none"] = (
@@ -113,6 +120,7 @@ class Identify:
     """Of the phase-blocked cross-validation."""
     read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
+    part: _Part = WHOLE
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -123,7 +131,7 @@ class Identify:
             self.out,
             self.recording,
             self.mass_gravity,
-            self.model,
+            self.part.of_any(self.model),
             method=self.method,
             friction=self.friction,
             weighting=self.weighting,
@@ -148,7 +156,8 @@ class Retrieve:
     bounds: Path | None = None
     """CSV with name, lower, upper for each link parameter; without it, the published bounds of the Panda."""
     model: Path | None = None
-    """The arm (MJCF) to set bounds around and to stay near to; without it, the one that was identified."""
+    """The arm (MJCF or URDF) to set bounds around and to stay near to; without it, the one that was
+    identified."""
     weighting: Literal["auto", "torque", "none"] = "auto"
     """Each direction of the coefficients by the torque that it moved, or the reliable ones alike, as the paper
     has it. Unless told, by torque where recordings were identified."""
@@ -156,6 +165,7 @@ class Retrieve:
     """Share the starts with other processes, here or on other machines: RANK/COUNT@HOST:PORT in each of them,
     with ranks from 0 and HOST:PORT free on the machine of rank 0; or `auto` where a launcher such as Slurm says
     it. Every process spreads its share over all its devices; rank 0 alone writes and prints."""
+    part: _Part = WHOLE
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -168,7 +178,7 @@ class Retrieve:
             self.out,
             self.identification,
             self.bounds,
-            self.model,
+            self.part.of_any(self.model),
             weighting=self.weighting,
             starts=self.starts,
             seed=self.seed,
@@ -184,7 +194,8 @@ class Export:
     out: Path
     """The MJCF to write; a .urdf suffix writes URDF instead."""
     model: Path | None = None
-    """Your MJCF, kept as it is but for the parameters; without it, the one that was identified."""
+    """Your MJCF or URDF, kept as it is but for the parameters; without it, the one that was identified."""
+    part: _Part = WHOLE
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -192,7 +203,7 @@ class Export:
         from . import pipeline
         from .retrieval import Retrieval
 
-        return pipeline.to_mjcf(Retrieval.load(self.retrieval), self.out, self.model)
+        return pipeline.to_mjcf(Retrieval.load(self.retrieval), self.out, self.part.of_any(self.model))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,7 +211,7 @@ class Validate:
     """Check an MJCF in MuJoCo and MJX, and against recordings."""
 
     model: Path
-    """The MJCF to check."""
+    """The MJCF or URDF to check."""
     recording: tuple[Path, ...]
     """Recordings with torque."""
     out: Path
@@ -211,6 +222,7 @@ class Validate:
     """Leave MJX out, which takes most of the time on a CPU; roll-outs are then C MuJoCo's alone."""
     read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
+    part: _Part = WHOLE
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -219,7 +231,7 @@ class Validate:
 
         return pipeline.validate_files(
             self.out,
-            self.model,
+            self.part.of(self.model),
             self.recording,
             cutoff=self.cutoff,
             in_mjx=not self.no_mjx,
@@ -237,13 +249,14 @@ class Diagnose:
     out: Path
     """Folder for diagnosis.json, report.html and corrected.xml."""
     model: Path | None = None
-    """The simulation as you have it (MJCF); without it, the project's own Panda."""
+    """The simulation as you have it (MJCF or URDF); without it, the project's own Panda."""
     reference: tuple[Path, ...] = ()
     """Recordings of the same arm from when nothing was wrong."""
     knowledge: Literal["exact", "identified", "rough", "unknown"] = "identified"
     """How well the numbers in the model are known."""
     read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
+    part: _Part = WHOLE
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -252,7 +265,7 @@ class Diagnose:
 
         return diagnosis.diagnose_files(
             self.out,
-            self.model,
+            self.part.of_any(self.model),
             self.recording,
             self.reference,
             self.knowledge,
@@ -295,7 +308,7 @@ class Payload:
     out: Path
     """Folder for payload.json, payload.xml and with_payload.xml."""
     model: Path | None = None
-    """The simulation as you have it (MJCF); without it, the project's own Panda."""
+    """The simulation as you have it (MJCF or URDF); without it, the project's own Panda."""
     frame: str = ""
     """Body or site of the MJCF, fixed to the last link, in which to tell the result; without it, one that is
     called a flange, else the last link's body."""
@@ -303,6 +316,7 @@ class Payload:
     """By which share all torques may be off together, as 0.1 for motor currents times gains known to 10 %."""
     read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
+    part: _Part = WHOLE
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -311,7 +325,7 @@ class Payload:
 
         return payload.payload_files(
             self.out,
-            self.model,
+            self.part.of_any(self.model),
             self.without,
             self.with_,
             frame=self.frame,
@@ -347,7 +361,7 @@ class Excite:
     out: Path
     """Folder for excitation.json, excitation.csv, joint_trajectory.yaml; for six joints excitation.script."""
     model: Path | None = None
-    """The arm, perhaps in its scene (MJCF); without it, the project's own Panda."""
+    """The arm, perhaps in its scene (MJCF or URDF); without it, the project's own Panda."""
     seconds: float = 20.0
     """Length of the motion, which starts and ends at rest and can be repeated."""
     identification: Path | None = None
@@ -384,6 +398,7 @@ class Excite:
     starts: int = 8
     """Random motions to start from."""
     seed: int = 0
+    part: _Part = WHOLE
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
@@ -393,7 +408,7 @@ class Excite:
         limits = {name: getattr(self, name) for name in ("velocity", "acceleration", "jerk", "torque")}
         return excitation.excite_files(
             self.out,
-            self.model,
+            self.part.of_any(self.model),
             limits,
             seconds=self.seconds,
             rate=self.rate,

@@ -1,7 +1,6 @@
 """`Arm`: a serial arm with names, units, limits and the physics its model already holds."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -9,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import Chain, rnea
 from jaxtyping import Array, Float
+
+from .model_file import Model
 
 FRICTION_LAW = ("friction_rate", "friction_slack")
 """Fields of an `Arm` that say how the friction it holds turns with the velocity; None in both says nothing."""
@@ -52,7 +53,7 @@ class Arm(eqx.Module):
     """R of the same [1/(kg m²)]."""
 
     @classmethod
-    def from_mjcf(cls, path: str | Path) -> "Arm":
+    def from_mjcf(cls, path: Model) -> "Arm":
         """The serial arm in a user's MJCF; `jaxpanda.mjcf` says what can be represented.
 
         Raises:

@@ -19,6 +19,7 @@ from scipy import sparse
 
 from .errors import InputError, MissingExtraError
 from .feasible import Bounds
+from .feasible.known import Known
 
 # Entries of the upper triangle of the 4x4 pseudo-inertia, column by column, as the solver's cone wants them.
 _ROW = np.array([0, 0, 1, 0, 1, 2, 0, 1, 2, 3])
@@ -68,6 +69,12 @@ def lower_bound(
     except ImportError:
         raise MissingExtraError("the certificate of optimality", "sdp") from None
     began = time.perf_counter()
+    known, every = Known.of(bounds), bounds.dof
+    if not known.nothing:  # what is known is no unknown; boxes that are points are opened, if anything
+        b = b - A[:, : 10 * every] @ known.phi.ravel()
+        unknown = np.repeat(np.isin(np.arange(every), known.free), 10)
+        unknown = np.concatenate([unknown, np.ones(A.shape[1] - 10 * every, bool)])
+        A, bounds = A[:, unknown], known.reduced()
     rows, columns = A.shape
     norm = float(np.linalg.norm(b)) or 1.0
     G, h = _linear(bounds, columns, extra_lower, extra_upper)
@@ -98,7 +105,7 @@ def lower_bound(
     links = 10 * bounds.dof
     return Certificate(
         lower_bound=max(0.0, solution.obj_val_dual * norm**2),
-        phi=x[:links].reshape(-1, 10),
+        phi=known.filled(x[:links].reshape(-1, 10)),
         extra=x[links:columns],
         seconds=time.perf_counter() - began,
     )

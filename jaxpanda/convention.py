@@ -7,10 +7,10 @@ module is read by `jaxpanda --help`, and imports JAX and numpy only when somethi
 import dataclasses
 import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .errors import InputError
+from .model_file import Model
 
 if TYPE_CHECKING:
     from .arm import Arm
@@ -90,7 +90,7 @@ class Convention:
             )
         return [int(word) - 1 for word in words], alone
 
-    def applied(self, recordings: Sequence["Recording"], model: Path | None = None) -> list["Recording"]:
+    def applied(self, recordings: Sequence["Recording"], model: Model | None = None) -> list["Recording"]:
         """The recordings as they are meant, with a note of what was done.
 
         Args:

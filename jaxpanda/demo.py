@@ -19,6 +19,7 @@ from .files import Kind, output_folder
 from .identification import Identification, identify
 from .inspection import inspect
 from .mjcf import from_mjcf, standard_from_com
+from .model_file import Model, ModelFile, part_of
 from .panda import published
 from .pipeline import arm_of, beyond_mjcf, recordings_of, to_mjcf
 from .reading import Reading
@@ -86,7 +87,7 @@ def demonstrate(
     out: str | Path,
     *,
     recordings: Sequence[Path] = (),
-    model: Path | None = None,
+    model: Model | None = None,
     starts: int = 2048,
     seed: int = 0,
     reading: Reading | None = None,
@@ -138,7 +139,8 @@ def demonstrate(
         with progress("exporting and validating"):
             written = to_mjcf(links, folder / MODEL, model)
             beyond, beside = beyond_mjcf(folder / MODEL)
-            checked = validate(folder / MODEL, testing, friction=beyond, gravity=convention.mounting)
+            corrected = folder / MODEL if model is None else ModelFile(folder / MODEL, part_of(model))
+            checked = validate(corrected, testing, friction=beyond, gravity=convention.mounting)
             checked = dataclasses.replace(checked, model=MODEL, notes=(*checked.notes, *beside))
         checked.save(folder)
         held_out = "the held-out recording" if virtual else "the recording itself"
@@ -169,7 +171,7 @@ def demonstrate(
     )
 
 
-def record(seed: int, model: Path | None = None, duration: float = 20.0) -> Virtual:
+def record(seed: int, model: Model | None = None, duration: float = 20.0) -> Virtual:
     """Let MuJoCo's C engine move an arm whose parameters differ from its model's by about a tenth.
 
     The Panda follows the published exciting trajectory and has friction and sensors of published sizes; any

@@ -18,7 +18,7 @@ and an impedance near one make it the law that is meant.
 
 # MuJoCo's names come from a compiled module without stubs.
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -177,6 +177,11 @@ def write_parameters(
         for i, link in enumerate(source.links):
             target = np.asarray(standard[i], float)
             if not _agree(target, meant[i], np.asarray(standard)):
+                if not np.any(meant[i]):
+                    raise InputError(
+                        f"{source.path}: link {link.body!r} stands between two joints of one body, without mass,"
+                        " the parameters give it some; identify with this file as --model"
+                    )
                 meant[i], edit = _inertial_edit(source, link, bodies[i], target, warnings)
                 edits.append(edit)
     joints = _joint_values(arm, friction)
@@ -229,7 +234,9 @@ def _body_elements(source: MjcfSource) -> list[markup.Element]:
     by_name = {e.attributes.get("name"): e for e in elements}
     found = []
     for link in source.links:
-        element = elements[link.body_id - 1] if in_order else by_name.get(link.body)
+        element = (
+            elements[link.body_id - 1] if in_order else by_name.get(source.model.body(link.body_id).name)
+        )
         if element is None:
             raise InputError(
                 f"{source.path}: body {link.body!r} is not written in this file (attached or replicated);"
@@ -241,6 +248,8 @@ def _body_elements(source: MjcfSource) -> list[markup.Element]:
 
 def _agree(a: np.ndarray, b: np.ndarray, like: np.ndarray) -> bool:
     """Whether two sets of parameters of a body are the same to rounding in the dtype of `like`."""
+    if b[0] == 0:  # the link of a body's first joint, where that has several
+        return not np.any(a)
     precision = _precision(like)
     length = np.sqrt(np.abs(b[4:]).max() / b[0])
     scale = b[0] * np.concatenate([[1.0], np.full(3, length), np.full(6, length**2)])
@@ -350,22 +359,30 @@ def _joint_edits(
                 continue
             degrees = name == "springref" and source.degrees and not before.chain.prismatic[i]
             values[name] = numbers(np.rad2deg(float(value[i])) if degrees else value[i])
-        own = has_own_friction_law(source.model, source.links[i].dof)
+        link = source.links[i]
+        place = link.joint_id - int(source.model.body_jntadr[link.body_id])
+        own = has_own_friction_law(source.model, link.dof)
         if joints["frictionloss"][i] > 0 and "frictionloss" in values and not own:
             values |= dry_friction(source.model.opt.timestep)
         if values:
-            edits.append(markup.Edit(_joint_element(body), values))
+            edits.append(markup.Edit(_joint_element(body, place), values))
     return edits
 
 
-def _joint_element(body: markup.Element) -> markup.Element:
-    """The one joint of a body, which may stand in a `frame` of it."""
+def _joint_element(body: markup.Element, place: int = 0) -> markup.Element:
+    """One of the joints of a body, which may stand in a `frame` of it."""
+    written = list(_joint_elements(body))
+    if place < len(written):
+        return written[place]
+    raise InputError(f"{body.file}: line {body.line}: the joint of this body is not written in the file")
+
+
+def _joint_elements(body: markup.Element) -> Iterator[markup.Element]:
     for child in body.children:
         if child.tag == "joint":
-            return child
-        if child.tag == "frame" and any(e.tag == "joint" for e in child.children):
-            return _joint_element(child)
-    raise InputError(f"{body.file}: line {body.line}: the joint of this body is not written in the file")
+            yield child
+        elif child.tag == "frame":
+            yield from _joint_elements(child)
 
 
 def dry_friction(timestep: float) -> dict[str, str]:

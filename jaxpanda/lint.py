@@ -3,13 +3,14 @@
 # MuJoCo's names come from a compiled module without stubs.
 import dataclasses
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Literal
 
 import mujoco
 import numpy as np
 
-from .mjcf import load_model, load_spec, own_log
+from .engine_log import own_log
+from .mjcf import load_model, load_spec
+from .model_file import Model
 
 OUTLIER = 3.0
 """How far a joint's friction may exceed that of every other hinge of its arm.
@@ -38,7 +39,7 @@ class Finding:
     message: str
 
 
-def lint(model: mujoco.MjModel | str | Path) -> list[Finding]:
+def lint(model: mujoco.MjModel | Model) -> list[Finding]:
     """What a file or a compiled model holds that its author hardly meant; the gravest first.
 
     Raises:
@@ -46,9 +47,8 @@ def lint(model: mujoco.MjModel | str | Path) -> list[Finding]:
     """
     findings: list[Finding] = []
     if not isinstance(model, mujoco.MjModel):
-        path = Path(model)
-        findings += _impossible_inertias(path)
-        model = load_model(path, balanceinertia=bool(findings))
+        findings += _impossible_inertias(model)
+        model = load_model(model, balanceinertia=bool(findings))
     checks = (_negative, _outliers, _armature, _placeholders, _near_edge)
     findings += [finding for check in checks for finding in check(model)]
     findings += [Finding("warning", "MJX", message) for message in ignored_by_mjx(model)]
@@ -71,7 +71,7 @@ def ignored_by_mjx(model: mujoco.MjModel) -> tuple[str, ...]:
     return tuple(f"{name} is ignored by MJX" for name, value in features.items() if np.any(value))
 
 
-def _impossible_inertias(path: Path) -> list[Finding]:
+def _impossible_inertias(path: Model) -> list[Finding]:
     """Inertials as written that no body can have; MuJoCo stops at the first of them."""
     spec = load_spec(path)
     findings = []
@@ -88,6 +88,8 @@ def _impossible_inertias(path: Path) -> list[Finding]:
             moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         else:
             moments = np.sort(body.inertia)
+        if not moments.any():  # a point mass
+            continue
         if moments[0] <= 0 or moments[2] - moments[0] - moments[1] > 1e-14 * moments[2]:
             a, b, c = (f"{moment:.4g}" for moment in moments)
             findings.append(

@@ -17,6 +17,7 @@ import numpy as np
 
 from . import inputs
 from .errors import InputError
+from .model_file import WHOLE, Part
 
 BYTES = 1 << 26
 """Most that a file of a model may have."""
@@ -84,6 +85,10 @@ class Document:
     root: Element
     inclusions: Mapping[str, Element] = dataclasses.field(default_factory=dict)
     """The `include` element of each of the other texts."""
+    part: Part = WHOLE
+    """What of it is meant."""
+    notes: tuple[str, ...] = ()
+    """What became of it on the way in."""
 
     @property
     def text(self) -> str:
@@ -94,25 +99,50 @@ class Document:
         return {name: text.encode() for name, text in self.texts.items() if name}
 
 
-def read(path: str | Path, root: str) -> Document:
+def read(path: str | Path, *roots: str, part: Part = WHOLE) -> Document:
     """The file and everything that it includes.
 
     Raises:
-        InputError: a file cannot be read, is no well-formed XML, or the first element is no `root`.
+        InputError: a file cannot be read, is no well-formed XML, the first element is none of `roots`, or an
+            include leads out of the model's folder and `part` does not allow that.
     """
     path = Path(path)
-    return parse(_decode(inputs.read_bytes(path, BYTES), path), root, path)
+    return parse(_decode(inputs.read_bytes(path, BYTES), path), roots, path, part=part)
 
 
-def parse(text: str, root: str, path: Path, known: Mapping[str, str] | None = None) -> Document:
+def parse(
+    text: str,
+    roots: str | tuple[str, ...],
+    path: Path,
+    known: Mapping[str, str] | None = None,
+    *,
+    part: Part = WHOLE,
+    notes: tuple[str, ...] = (),
+) -> Document:
     """The document with this text; what it includes comes from `known` or else from beside `path`."""
     tree = _tree(text, path)
-    if tree.tag != root:
-        raise InputError(f"{path}: line {tree.line}: starts with <{tree.tag}>, where <{root}> is expected")
+    roots = (roots,) if isinstance(roots, str) else roots
+    if tree.tag not in roots:
+        expected = " or ".join(f"<{root}>" for root in roots)
+        raise InputError(f"{path}: line {tree.line}: starts with <{tree.tag}>, where {expected} is expected")
     texts, inclusions = {"": text}, {}
-    _include(tree, path, known or {}, texts, inclusions)
+    _include(tree, path, known or {}, texts, inclusions, part)
     _require_size(tree)
-    return Document(path, texts, tree, inclusions)
+    return Document(path, texts, tree, inclusions, part, notes)
+
+
+def require_inside(path: Path, file: Path, part: Part, what: str) -> None:
+    """Refuse a file that lies outside of the folder of the model at `path`, unless the user allowed it.
+
+    Raises:
+        InputError: naming the option that allows it.
+    """
+    if part.outside or file.resolve().is_relative_to(path.parent.resolve()):
+        return
+    raise InputError(
+        f"{what}, which lies outside of the model's folder; --outside allows that (from Python"
+        " ModelFile(path, Part(outside=True)))"
+    )
 
 
 def _require_size(tree: Element) -> None:
@@ -159,7 +189,7 @@ def edit(document: Document, edits: Iterable[Edit], names: Mapping[str, str] | N
             data[name] = data[name][:start] + new + data[name][stop:]
         texts[name] = data[name].decode()
     known = {(names or {}).get(name, name): text for name, text in texts.items() if name}
-    return parse(texts[""], document.root.tag, document.path, known)
+    return parse(texts[""], document.root.tag, document.path, known, part=document.part, notes=document.notes)
 
 
 def gathered(document: Document) -> Document:
@@ -253,13 +283,14 @@ def _include(
     known: Mapping[str, str],
     texts: dict[str, str],
     inclusions: dict[str, Element],
+    part: Part,
     depth: int = 0,
 ) -> None:
     """Put the children of every included file where its `include` stands."""
     children = []
     for child in tree.children:
         if child.tag != "include":
-            _include(child, path, known, texts, inclusions, depth)
+            _include(child, path, known, texts, inclusions, part, depth)
             children.append(child)
             continue
         name = child.attributes.get("file", "")
@@ -270,12 +301,13 @@ def _include(
         if name in known:
             texts[name] = known[name]
         else:
+            require_inside(path, file, part, f"{where}: includes {name!r}")
             texts[name] = _decode(inputs.read_bytes(file, BYTES, f"{where}: includes {name!r}, which"), file)
         included = _tree(texts[name], file, name)
         inclusions[name] = child
         if depth >= INCLUDES:
             raise InputError(f"{where}: includes {name!r} at a depth of more than {INCLUDES} files")
-        _include(included, path, known, texts, inclusions, depth + 1)
+        _include(included, path, known, texts, inclusions, part, depth + 1)
         for element in included.children:
             element.parent = tree
             children.append(element)

@@ -1,9 +1,11 @@
 r"""The serial arm in a user's MJCF.
 
 MuJoCo's own compiler reads the file, so defaults, includes, units and inertia from geoms are as MuJoCo has
-them. What the arm is: the hinges and slides met one after another on the way out from the world. Bodies
-without a joint, and the fingers of a gripper (where the chain branches), are lumped into the link that
-carries them, at the reference pose of the file.
+them. What the arm is: the hinges and slides met one after another on the way out from the world, or those
+between two bodies that the user names (`model_file.Part`). Bodies without a joint, and the fingers of a gripper
+(where the chain branches), are lumped into the link that carries them, at the reference pose of the file; what
+the arm stands on is held there. Of several joints on one body all but the last have links without mass. A URDF
+is read by MuJoCo too, and is MJCF from there on (`urdf_in`).
 
 Link frame: the body's own where the joint turns about (or slides along) the body's +z through its origin,
 as in files made from a modified Denavit-Hartenberg table; else the body's turned by the smallest angle that
@@ -11,10 +13,11 @@ brings z onto the axis, with its origin at the joint's position.
 """
 
 # MuJoCo's names come from a compiled module without stubs.
-import contextlib
 import dataclasses
+import difflib
 import warnings
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -25,10 +28,16 @@ from jaxtyping import Float
 
 from . import inputs, markup
 from .arm import KNOWN, Arm
+from .engine_log import own_log
 from .errors import InputError
+from .model_file import Model, ModelFile, Part, part_of
+from .urdf_in import as_mjcf
 
 FINGER_JOINTS = 4
 """Most joints one after another in a finger; longer branches are arms of their own."""
+LEAST_JOINTS = 3
+"""What is offered as an arm has so many, where there is such."""
+_OFFERED = 4
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -95,32 +104,30 @@ class MjcfSource:
         return full
 
 
-@contextlib.contextmanager
-def own_log() -> Iterator[list[str]]:
-    """What MuJoCo warns of; it would write that to a file in the folder that it was called from."""
-    said: list[str] = []
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(said.append)
-    try:
-        yield said
-    finally:
-        mujoco.set_mju_user_warning(before)
+def read(model: Model) -> markup.Document:
+    """The text of a model, as MJCF, with what is meant of it.
+
+    Raises:
+        InputError: neither MJCF nor URDF, or a URDF that MuJoCo refuses.
+    """
+    document = markup.read(Path(model), "mujoco", "robot", part=part_of(model))
+    return as_mjcf(document) if document.root.tag == "robot" else document
 
 
-def from_mjcf(path: str | Path, gravity: Sequence[float] | None = None) -> tuple[Arm, MjcfSource]:
-    """The serial arm in an MJCF file, and where its parts stand in it.
+def from_mjcf(path: Model, gravity: Sequence[float] | None = None) -> tuple[Arm, MjcfSource]:
+    """The serial arm in an MJCF or URDF file, and where its parts stand in it.
 
     Meshes may be missing where a body has its `inertial`. `gravcomp` is no part of the arm: it is a force of
     the simulation, while a measured torque carries the weight.
 
     Args:
-        path: of the file.
+        path: of the file, or which arm of it is meant.
         gravity: in place of the file's, in the frame of its world [m/s²].
 
     Raises:
         InputError: no MJCF, one that MuJoCo refuses, or something that a serial arm cannot represent.
     """
-    return from_document(with_gravity(markup.read(path, "mujoco"), gravity))
+    return from_document(with_gravity(read(path), gravity))
 
 
 def with_gravity(document: markup.Document, gravity: Sequence[float] | None) -> markup.Document:
@@ -149,10 +156,11 @@ def from_document(document: markup.Document, dropped: frozenset[int] | None = No
         spec = _parse(document)
         dropped = _drop_looks(spec, document, dropped)
         model = _compile(spec, document.path)
-    notes = [f"MuJoCo warns: {what}" for what in dict.fromkeys([*(str(w.message) for w in said), *logged])]
+    notes = [*document.notes]
+    notes += [f"MuJoCo warns: {what}" for what in dict.fromkeys([*(str(w.message) for w in said), *logged])]
     if dropped:
         notes.append(f"{len(dropped)} mesh geoms that give looks or contacts only were not read")
-    joints, locked = _serial_joints(model, document.path)
+    joints, locked = _serial_joints(model, document.path, document.part)
     _check_joints(model, joints, document.path)
     notes += _notes(model, joints, locked)
     links, chain, standard = _links(model, joints)
@@ -163,7 +171,7 @@ def from_document(document: markup.Document, dropped: frozenset[int] | None = No
 
 
 @own_log()
-def load_model(path: str | Path, *, balanceinertia: bool = False) -> mujoco.MjModel:
+def load_model(path: Model, *, balanceinertia: bool = False) -> mujoco.MjModel:
     """The compiled model of a file, without the meshes that only give looks or contacts.
 
     Args:
@@ -173,21 +181,33 @@ def load_model(path: str | Path, *, balanceinertia: bool = False) -> mujoco.MjMo
     Raises:
         InputError: no MJCF, or one that MuJoCo refuses.
     """
-    document = markup.read(path, "mujoco")
+    document = read(path)
     spec = _parse(document)
     _drop_looks(spec, document)
     spec.compiler.balanceinertia |= balanceinertia
     return _compile(spec, document.path)
 
 
+def file_with(arm: Arm, path: str | Path) -> ModelFile:
+    """A file that holds this arm, with what chooses the arm by the names of its joints."""
+    model = load_model(ModelFile(path, Part(outside=True)))
+    names = [model.joint(joint).name for joint in range(model.njnt)]
+    if not set(arm.joint_names) <= set(names):
+        return ModelFile(path)
+    first, last = (int(model.jnt_bodyid[names.index(arm.joint_names[i])]) for i in (0, -1))
+    base = int(model.body_parentid[first])
+    root, tip = (model.body(body).name for body in (base, last))
+    return ModelFile(path, Part(root if base else "", tip if root or not base else "", outside=True))
+
+
 @own_log()
-def load_spec(path: str | Path) -> mujoco.MjSpec:
+def load_spec(path: Model) -> mujoco.MjSpec:
     """A file as MuJoCo's parser has it, before compilation.
 
     Raises:
         InputError: no MJCF.
     """
-    return _parse(markup.read(path, "mujoco"))
+    return _parse(read(path))
 
 
 def with_shapes(document: markup.Document) -> mujoco.MjSpec:
@@ -203,6 +223,7 @@ def with_shapes(document: markup.Document) -> mujoco.MjSpec:
     for asset in [*spec.meshes, *spec.hfields]:
         file = document.path.parent / spec.meshdir / asset.file
         if asset.file and file.exists():
+            markup.require_inside(document.path, file, document.part, f"{document.path}: shows {asset.file}")
             inputs.require_regular(file)
     return spec
 
@@ -215,18 +236,39 @@ def _parse(document: markup.Document) -> mujoco.MjSpec:
         raise InputError(f"{document.path}: {_sentence(error)}") from None
     spec.modelfiledir = str(document.path.parent)
     spec.compiler.fusestatic = False  # the bodies stay those of the text; the mechanics are the same
+    _find_assets(spec, document)
     return spec
+
+
+def _find_assets(spec: mujoco.MjSpec, document: markup.Document) -> None:
+    """Name the files of shapes as MuJoCo does that reads the model from its folder.
+
+    Beside the model, in the compiler's folder, or else beside the file that is included and names them; parsed
+    from a string, MuJoCo looks from where it was called.
+    """
+    for tag, assets in (("mesh", spec.meshes), ("hfield", spec.hfields)):
+        elements = [e for e in document.root.walk() if e.tag == tag and e.has_ancestor("asset")]
+        if len(elements) != len(assets):  # some come with attached models
+            continue
+        for element, asset in zip(elements, assets, strict=True):
+            name = element.attributes.get("file", "")
+            places = document.path.parent / spec.meshdir / name, element.file.parent / name
+            found = [place for place in places if name and place.is_file()]
+            if found and element.source:
+                asset.file = str(found[0].absolute())
 
 
 def _attached(document: markup.Document) -> dict[str, bytes]:
     """Other models that the file attaches parts of."""
     names = [e.attributes.get("file", "") for e in document.root.walk() if e.tag == "model"]
     files = {name: document.path.parent / name for name in names if name}
-    return {
-        name: inputs.read_bytes(file, markup.BYTES, f"{document.path}: attaches {name!r}, which")
-        for name, file in files.items()
-        if file.exists()
-    }
+    found = {}
+    for name, file in files.items():
+        if file.exists():
+            what = f"{document.path}: attaches {name!r}"
+            markup.require_inside(document.path, file, document.part, what)
+            found[name] = inputs.read_bytes(file, markup.BYTES, f"{what}, which")
+    return found
 
 
 def _compile(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
@@ -308,57 +350,145 @@ def _check_mesh(spec: mujoco.MjSpec, geom, document: markup.Document) -> None:
             f"{document.path}: body {geom.parent.name!r} takes its inertia from mesh {geom.meshname!r},"
             f" and {file} is missing; put the mesh there or give the body an <inertial>"
         )
+    what = (
+        f"{document.path}: body {geom.parent.name!r} takes its inertia from mesh {geom.meshname!r} in {file}"
+    )
+    markup.require_inside(document.path, file, document.part, what)
     inputs.require_regular(file)
 
 
-def _serial_joints(model: mujoco.MjModel, path: Path) -> tuple[list[int], list[int]]:
+def _serial_joints(model: mujoco.MjModel, path: Path, part: Part) -> tuple[list[int], list[int]]:
     """Joints of the arm from the base outwards, and joints of a gripper behind it."""
-    trees = _trees(model)
-    if not trees:
-        raise InputError(f"{path}: has no joint, so there is no arm in it")
-    arms = [root for root in trees if not _is_object(model, root)]
-    if not arms:
-        joint = _joint_name(model, int(model.body_jntadr[trees[0]]))
-        raise InputError(
-            f"{path}: {joint} is a free or ball joint; an arm needs a fixed base, hinges and slides"
-        )
-    if len(arms) > 1:
-        a, b = (_body_name(model, body) for body in arms[:2])
-        raise InputError(
-            f"{path}: {a} and {b} both start a mechanism on the world; one serial arm is expected"
-        )
-    body, joints = arms[0], []
-    while True:
-        if model.body_jntnum[body] > 1:
-            raise InputError(
-                f"{path}: {_body_name(model, body)} has {model.body_jntnum[body]} joints;"
-                " give each joint a body of its own"
-            )
-        joints.append(int(model.body_jntadr[body]))
-        branches = _moving_children(model, body)
-        if len(branches) != 1:
-            break
-        body = branches[0]
-    for branch in branches:
-        if _depth(model, branch) > min(FINGER_JOINTS, len(joints) - 1):
-            others = " and ".join(_body_name(model, b) for b in branches[:2])
-            raise InputError(
-                f"{path}: the arm branches at {_body_name(model, body)} into {others};"
-                " one serial arm is expected"
-            )
-    locked = [j for branch in branches for b in _subtree(model, branch) for j in _joints_of(model, b)]
+    base = _body_called(model, part.root, "--root", path) if part.root else 0
+    if part.tip:
+        bodies = _way_to(model, base, _body_called(model, part.tip, "--tip", path), path, part)
+    else:
+        bodies = _way_out(model, base, path)
+    joints = [joint for body in bodies for joint in _joints_of(model, body)]
+    owner = _owners(model, joints)
+    locked = [j for j in range(model.njnt) if j not in joints and owner[model.jnt_bodyid[j]] > 0]
     return joints, locked
 
 
-def _trees(model: mujoco.MjModel) -> list[int]:
-    """The first moving body of everything that stands on the world."""
-    return [b for b in range(1, model.nbody) if model.body_jntnum[b] and _moving_parent(model, b) == 0]
+def _body_called(model: mujoco.MjModel, name: str, option: str, path: Path) -> int:
+    names = [model.body(body).name for body in range(model.nbody)]
+    if name in names:
+        return names.index(name)
+    close = difflib.get_close_matches(name, names, 1)
+    meant = f" (did you mean {close[0]!r}?)" if close else ""
+    raise InputError(f"{path}: {option} {name}: has no body of that name{meant}{_offer(model)}")
+
+
+def _way_to(model: mujoco.MjModel, base: int, tip: int, path: Path, part: Part) -> list[int]:
+    """Moving bodies from the base to the tip."""
+    way = [tip]
+    while way[-1] not in (0, base):
+        way.append(int(model.body_parentid[way[-1]]))
+    if way[-1] != base or tip == base:
+        raise InputError(f"{path}: --tip {part.tip} does not lie beyond --root {part.root}{_offer(model)}")
+    bodies = [body for body in way[-2::-1] if model.body_jntnum[body]]
+    if not bodies:
+        raise InputError(f"{path}: no joint leads to --tip {part.tip}{_offer(model)}")
+    _require_turns_or_slides(model, bodies, path)
+    return bodies
+
+
+def _way_out(model: mujoco.MjModel, base: int, path: Path) -> list[int]:
+    """Moving bodies one after another from the base, as far as there is one way to go."""
+    trees = _first_moving(model, base)
+    if not trees:
+        if base:
+            raise InputError(f"{path}: nothing moves beyond --root {model.body(base).name}{_offer(model)}")
+        raise InputError(f"{path}: has no joint, so there is no arm in it")
+    arms = [root for root in trees if not _is_object(model, root)]
+    if not arms:
+        _require_turns_or_slides(model, trees, path)
+    if len(arms) > 1:
+        a, b = (_body_name(model, body) for body in arms[:2])
+        raise InputError(
+            f"{path}: {a} and {b} both start a mechanism on {'that body' if base else 'the world'}; one serial"
+            f" arm is expected{_offer(model)}"
+        )
+    bodies = [arms[0]]
+    while len(branches := _first_moving(model, bodies[-1])) == 1:
+        bodies.append(branches[0])
+    joints = sum(int(model.body_jntnum[body]) for body in bodies)
+    if any(_depth(model, branch) > min(FINGER_JOINTS, joints - 1) for branch in branches):
+        others = " and ".join(_body_name(model, b) for b in branches[:2])
+        raise InputError(
+            f"{path}: the arm branches at {_body_name(model, bodies[-1])} into {others}; one serial arm is"
+            f" expected{_offer(model)}"
+        )
+    _require_turns_or_slides(model, bodies, path)
+    return bodies
+
+
+def _offer(model: mujoco.MjModel) -> str:
+    """The options that choose an arm of this model, those of most joints first."""
+    found = sorted(_arms(model), key=lambda one: -one[1])
+    found = [one for one in found if one[1] >= LEAST_JOINTS] or found
+    if not found:
+        return ""
+    said = ", ".join(
+        f"{options} ({joints} joint{'s' * (joints > 1)})" for options, joints in found[:_OFFERED]
+    )
+    rest = f" or {len(found) - _OFFERED} more" if len(found) > _OFFERED else ""
+    return f"; choose one by {said}{rest}"
+
+
+def _arms(model: mujoco.MjModel) -> Iterator[tuple[str, int]]:
+    """The options for each chain of hinges and slides that ends in fingers or in nothing, and its joints."""
+    for tip in range(1, model.nbody):
+        if not _turns_or_slides(model, tip):
+            continue
+        bodies, beyond = [tip], _first_moving(model, tip)
+        if len(beyond) == 1:
+            continue
+        while True:
+            parent = _moving_parent(model, bodies[-1])
+            beside = [b for b in _first_moving(model, parent) if b != bodies[-1]] if parent else []
+            ends = not parent or not _turns_or_slides(model, parent)
+            if ends or beside:
+                yield from _options(model, bodies, beyond)
+            if ends or any(_depth(model, b) > FINGER_JOINTS for b in beside):
+                break
+            bodies.append(parent)
+
+
+def _options(model: mujoco.MjModel, bodies: list[int], beyond: list[int]) -> Iterator[tuple[str, int]]:
+    """The options that choose these bodies, the last of the arm first, where they can be an arm."""
+    joints = sum(int(model.body_jntnum[body]) for body in bodies)
+    if any(_depth(model, branch) > min(FINGER_JOINTS, joints - 1) for branch in beyond):
+        return
+    base = int(model.body_parentid[bodies[-1]])
+    root, tip = model.body(base).name, model.body(bodies[0]).name
+    alone = all(_first_moving(model, body) == [other] for body, other in pairwise([base, *bodies[::-1]]))
+    if base and root and alone:
+        yield f"--root {root}", joints
+    elif root and tip:
+        yield (f"--root {root} " if base else "") + f"--tip {tip}", joints
+
+
+def _require_turns_or_slides(model: mujoco.MjModel, bodies: list[int], path: Path) -> None:
+    for body in bodies:
+        if not _turns_or_slides(model, body):
+            name = _joint_name(model, int(model.body_jntadr[body]))
+            raise InputError(
+                f"{path}: {name} is a free or ball joint; an arm needs a fixed base, hinges and"
+                f" slides{_offer(model)}"
+            )
+
+
+def _turns_or_slides(model: mujoco.MjModel, body: int) -> bool:
+    """Whether the body has joints, all hinges or slides."""
+    joints = _joints_of(model, body)
+    return bool(joints) and all(model.jnt_type[joint] in (_HINGE, _SLIDE) for joint in joints)
 
 
 def _is_object(model: mujoco.MjModel, root: int) -> bool:
     """A thing that floats freely in the scene, and is not the base of an arm."""
     free = model.jnt_type[model.body_jntadr[root]] == _FREE
-    return bool(free) and not _moving_children(model, root)
+    return bool(free) and not _first_moving(model, root)
 
 
 def _moving_parent(model: mujoco.MjModel, body: int) -> int:
@@ -368,17 +498,20 @@ def _moving_parent(model: mujoco.MjModel, body: int) -> int:
     return body
 
 
-def _moving_children(model: mujoco.MjModel, body: int) -> list[int]:
-    return [b for b in range(1, model.nbody) if model.body_jntnum[b] and _moving_parent(model, b) == body]
-
-
-def _subtree(model: mujoco.MjModel, body: int) -> list[int]:
-    """The body and the moving bodies beyond it."""
-    return [body] + [b for child in _moving_children(model, body) for b in _subtree(model, child)]
+def _first_moving(model: mujoco.MjModel, base: int) -> list[int]:
+    """The bodies with joints that come first on the ways out from a body."""
+    found, still = [], {base}
+    for body in range(base + 1, model.nbody):  # MuJoCo numbers parents before children
+        if model.body_parentid[body] in still:
+            if model.body_jntnum[body]:
+                found.append(body)
+            else:
+                still.add(body)
+    return found
 
 
 def _depth(model: mujoco.MjModel, body: int) -> int:
-    deeper = [_depth(model, child) for child in _moving_children(model, body)]
+    deeper = [_depth(model, child) for child in _first_moving(model, body)]
     return int(model.body_jntnum[body]) + max(deeper, default=0)
 
 
@@ -391,10 +524,6 @@ def _check_joints(model: mujoco.MjModel, joints: list[int], path: Path) -> None:
     dofs = model.jnt_dofadr[joints]
     for joint, dof in zip(joints, dofs, strict=True):
         name = _joint_name(model, joint)
-        if model.jnt_type[joint] not in (_HINGE, _SLIDE):
-            raise InputError(
-                f"{path}: {name} is a free or ball joint; an arm needs a fixed base, hinges and slides"
-            )
         if np.any(model.dof_dampingpoly[dof]) or np.any(model.jnt_stiffnesspoly[joint]):
             raise InputError(
                 f"{path}: {name} has polynomial damping or stiffness; only the linear term is understood"
@@ -483,7 +612,8 @@ def _check_loops(model: mujoco.MjModel, joints: list[int], path: Path) -> None:
             closes = owner[a] != owner[b] and bool({owner[a], owner[b]} & bodies)
         else:
             closes = False
-        if closes and model.eq_active0[eq]:
+        held = kind in _TIES and max(model.body_mocapid[a], model.body_mocapid[b]) >= 0  # by the user's hand
+        if closes and model.eq_active0[eq] and not held:
             raise InputError(f"{path}: equality {name!r} closes a loop over the arm; a serial arm has none")
 
 
@@ -506,10 +636,19 @@ def _notes(model: mujoco.MjModel, joints: list[int], locked: list[int]) -> list[
     notes = []
     if locked:
         names = ", ".join(model.joint(j).name or f"number {j + 1}" for j in locked)
-        notes.append(f"gripper joints {names} are locked at their reference and lumped into the last link")
+        notes.append(
+            f"joints {names} are locked at their reference and lumped into the link that carries them"
+        )
     owner = _owners(model, joints)
-    if np.any(owner < 0):
-        notes.append(f"{int(np.sum(owner < 0))} loose bodies of the scene are no part of the arm")
+    base = _bodies_below(model, int(model.jnt_bodyid[joints[0]]))
+    held = [j for body in base for j in _joints_of(model, body)]
+    if held:
+        names = ", ".join(model.joint(j).name or f"number {j + 1}" for j in held)
+        notes.append(f"joints {names}, on which the arm stands, are held at their reference")
+    if loose := int(np.sum(owner < 0)) - sum(owner[body] < 0 for body in base):
+        notes.append(f"{loose} loose bodies of the scene are no part of the arm")
+    if np.any(model.body_mocapid >= 0) and np.any(np.isin(model.eq_type, _TIES)):
+        notes.append("what ties the arm to a mocap body is ignored: it is a hand of the simulation")
     if np.any(model.body_gravcomp[owner > 0]):
         notes.append(
             "gravcomp is ignored: it is a force of the simulation; a measured torque carries the weight"
@@ -517,6 +656,14 @@ def _notes(model: mujoco.MjModel, joints: list[int], locked: list[int]) -> list[
     if model.opt.density or model.opt.viscosity:
         notes.append("the drag of the medium (density, viscosity) is ignored")
     return notes
+
+
+def _bodies_below(model: mujoco.MjModel, body: int) -> list[int]:
+    """What carries a body, from its parent to the world."""
+    found = []
+    while body := int(model.body_parentid[body]):
+        found.append(body)
+    return found
 
 
 def _links(
@@ -532,7 +679,7 @@ def _links(
     links, standard, rotations, origins = [], [], [], []
     R_wp, p_wp = np.eye(3), np.zeros(3)
     for joint in joints:
-        body = int(model.jnt_bodyid[joint])
+        body, joint_name = int(model.jnt_bodyid[joint]), model.joint(joint).name or f"joint{joint + 1}"
         R_bl, p_bl = _link_frame(model, joint)
         R_wb, p_wb = pose[body]
         R_wl, p_wl = R_wb @ R_bl, p_wb + R_wb @ p_bl
@@ -542,16 +689,18 @@ def _links(
         rotations.append(R if slides else R @ _turn_z(-q0))
         origins.append(p - q0 * R[:, 2] if slides else p)
 
+        last = joint == _joints_of(model, body)[-1]  # the links of a body's other joints have no mass
         phi = {
-            b: _body_standard(model, b, pose[b], (R_wl, p_wl)) for b in np.flatnonzero(owner == body).tolist()
+            b: _body_standard(model, b, pose[b], (R_wl, p_wl))
+            for b in np.flatnonzero((owner == body) & last).tolist()
         }
-        own = phi.pop(body)
+        own = phi.pop(body, np.zeros(10))
         lumped = np.sum(list(phi.values()), 0) if phi else np.zeros(10)
         standard.append(own + lumped)
         links.append(
             MjcfLink(
-                body=model.body(body).name or f"body{body}",
-                joint=model.joint(joint).name or f"joint{joint + 1}",
+                body=(model.body(body).name or f"body{body}") + ("" if last else f"/{joint_name}"),
+                joint=joint_name,
                 body_id=body,
                 joint_id=joint,
                 dof=int(model.jnt_dofadr[joint]),

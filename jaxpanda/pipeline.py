@@ -21,6 +21,7 @@ from .identification.result import KIND as IDENTIFICATION
 from .inspection import Inspection, inspect
 from .lint import lint
 from .mjcf import from_document, from_mjcf
+from .model_file import Model, ModelFile, part_of
 from .reading import Reading
 from .recordings import Recording, content_of, distinct, load, load_many
 from .retrieval import CHECKPOINT_FILE, Retrieval, retrieve
@@ -31,7 +32,7 @@ from .validation import KIND as VALIDATION
 from .validation import Validation, validate
 
 
-def arm_of(model: Path | None, gravity: Sequence[float] | None = None) -> Arm:
+def arm_of(model: Model | None, gravity: Sequence[float] | None = None) -> Arm:
     """The arm in a user's MJCF, or under another gravity; without a file, the project's own Panda."""
     arm = Arm.panda() if model is None else Arm.from_mjcf(model)
     if gravity is None:
@@ -43,7 +44,7 @@ def recordings_of(
     paths: Sequence[Path],
     arm: Arm | None = None,
     *,
-    model: Path | None = None,
+    model: Model | None = None,
     reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> list[Recording]:
@@ -69,7 +70,7 @@ class Inspections:
 
 def inspect_files(
     paths: Sequence[Path],
-    model: Path | None,
+    model: Model | None,
     reading: Reading | None = None,
     convention: Convention = PLAIN,
 ) -> Inspections:
@@ -121,7 +122,7 @@ def identify_files(
     out: Path,
     recordings: Sequence[Path],
     mass_gravity: Path | None,
-    model: Path | None,
+    model: Model | None,
     *,
     method: str,
     friction: str,
@@ -150,7 +151,9 @@ def identify_files(
                     folds=folds,
                     progress=tick,
                 )
-        found = dataclasses.replace(found, model_file="" if model is None else str(model.resolve()))
+        if model is not None:
+            file = str(Path(model).resolve())
+            found = dataclasses.replace(found, model_file=file, model_part=part_of(model))
         found.save(folder)
     return found
 
@@ -159,7 +162,7 @@ def retrieve_files(
     out: Path,
     identification: Path,
     bounds: Path | None,
-    model: Path | None,
+    model: Model | None,
     *,
     weighting: Literal["auto", "torque", "none"],
     starts: int,
@@ -224,7 +227,7 @@ class Export:
         }
 
 
-def to_mjcf(links: Retrieval, out: str | Path, model: str | Path | None = None) -> Export:
+def to_mjcf(links: Retrieval, out: str | Path, model: Model | None = None) -> Export:
     """Write retrieved links, and the friction identified with them, as MJCF (or URDF, by the suffix).
 
     Armature, springs and friction that the identified model held stay, in whichever file is written. What MJCF
@@ -246,7 +249,7 @@ def to_mjcf(links: Retrieval, out: str | Path, model: str | Path | None = None) 
         return _to_mjcf(links, out, model or _identified_file(links))
 
 
-def _to_mjcf(links: Retrieval, out: Path, model: str | Path | None) -> Export:
+def _to_mjcf(links: Retrieval, out: Path, model: Model | None) -> Export:
     own = model is None
     arm, source = from_document(markup.parse(panda_mjcf(), "mujoco", out)) if own else from_mjcf(model)
     if links.dof != arm.dof:
@@ -260,22 +263,23 @@ def _to_mjcf(links: Retrieval, out: Path, model: str | Path | None) -> Export:
     return Export(out, () if own else written.changes, (*written.warnings, *written.save(out)))
 
 
-def _identified_file(links: Retrieval) -> Path | None:
+def _identified_file(links: Retrieval) -> ModelFile | None:
     """The MJCF to export into where none is given; None for the project's own Panda."""
     if not links.model_file:
-        if links.arm not in ("", "panda"):
+        if not links.own:
             raise InputError(
-                f"export: the links are those of the arm '{links.arm}'; give its MJCF by --model"
+                f"export: the links are those of the arm '{links.arm}', which is not the project's own Panda;"
+                " give its MJCF by --model"
             )
         return None
     if not (model := Path(links.model_file)).is_file():
         raise InputError(f"{model}: the MJCF that was identified is not there any more; give it by --model")
-    return model
+    return ModelFile(model, links.model_part)
 
 
 def validate_files(
     out: Path,
-    model: Path,
+    model: Model,
     recordings: Sequence[Path],
     *,
     cutoff: float,
@@ -298,9 +302,9 @@ def validate_files(
     return checked
 
 
-def beyond_mjcf(model: Path) -> tuple[Friction | None, tuple[str, ...]]:
+def beyond_mjcf(model: Model) -> tuple[Friction | None, tuple[str, ...]]:
     """The constant torque in `<name>.jaxpanda.json` beside a model that was exported here, and a note of it."""
-    file = sidecar_of(model)
+    file = sidecar_of(Path(model))
     if not file.exists():
         return None, ()
     offset = np.array(read_sidecar(file)["torque_offset"])

@@ -19,8 +19,6 @@ from .errors import InputError
 from .feasible import Bounds, Constraint, Links, Solutions, exact_penalty, solve
 from .feasible.bounds import INERTIA
 from .feasible.buildable import doubts, reach
-from .feasible.constraints import less_lumped
-from .feasible.nearest import are_buildable
 from .feasible.schedule import Device
 from .feasible.solver import NOTHING, STARTS
 from .files import Kind, finite, output_folder, settle, write_json, write_npz
@@ -29,7 +27,8 @@ from .identification import Identification
 from .identification.condensed import Evidence, least_friction, own_parameters, with_own_parameters
 from .identification.result import known_physics
 from .inputs import read_json, read_npz
-from .panda import panda
+from .model_file import WHOLE, Part
+from .panda import is_panda, panda
 from .parameters import coefficient_matrix
 
 SCHEMA = "jaxpanda.retrieval/1"
@@ -46,6 +45,11 @@ TORQUE_CONCESSION = 0.01
 not fitted that of the real Panda's links is lower for it: the model knows better what torque hardly tells."""
 ACTIVE = 1e-5
 """A constraint is active where its margin is below this share of its box (triangle inequality: [kg m²])."""
+_POINT = 1e-9
+_LEAST_SIZE = 0.01  # [m]: where a centre of mass is known
+_DOUBT = (
+    1.05  # factor of the torque error, or of the objective's root, that the room for carried bodies may cost
+)
 _BLOCK = 16384  # starts described at once
 
 
@@ -78,6 +82,8 @@ class Retrieval:
     run_seconds: float
     link_names: tuple[str, ...]
     arm: str = ""
+    own: bool = True
+    """Whether that is the project's own Panda, into which links are exported where no file is named."""
     friction: Friction | None = None
     """For the export: as identified or, under the weighting "torque", as it serves these links best, none of it
     negative."""
@@ -85,6 +91,8 @@ class Retrieval:
     """What the model that was identified held beyond rigid links; carried along too."""
     model_file: str = ""
     """The MJCF that was identified, where that is known."""
+    model_part: Part = WHOLE
+    """Which arm of that file it is."""
     rmse: Float[np.ndarray, " dof"] | None = None
     """What these links and this friction leave of the torque that they were identified from [N m]."""
     relative_error_percent: float | None = None
@@ -116,6 +124,7 @@ class Retrieval:
         return {
             "schema": SCHEMA,
             "arm": self.arm,
+            "own": self.own,
             "starts": self.starts,
             "seed": self.seed,
             "objective": self.objective,
@@ -132,6 +141,7 @@ class Retrieval:
             "spread": {name: list(pair) for name, pair in self.spread.items()},
             "weighting": self.weighting,
             "model_file": self.model_file or None,
+            "model_part": self.model_part.to_json(),
             "rmse": [] if self.rmse is None else self.rmse.tolist(),
             "relative_error_percent": self.relative_error_percent,
             "cross_validated_rmse": (
@@ -184,9 +194,11 @@ class Retrieval:
                 run_seconds=float(document["seconds"]["run"]),
                 link_names=tuple(link["name"] for link in document["links"]),
                 arm=document["arm"],
+                own=bool(document.get("own", document["arm"] in ("", "panda"))),
                 friction=Friction.from_json(document["friction"]) if document["friction"] else None,
                 known=known_physics(document["known"], len(document["links"]), str(file)),
                 model_file=document.get("model_file") or "",
+                model_part=Part.from_json(document.get("model_part")),
                 rmse=_array(document.get("rmse")),
                 relative_error_percent=document.get("relative_error_percent"),
                 cross_validated_rmse=_array(document.get("cross_validated_rmse")),
@@ -263,7 +275,9 @@ def retrieve(
         weighting = "torque" if table.method in ("trajectory", "one_step") else "none"
     A, b = _equations(table, boxes.dof, weighting)
     constraints = tuple(constraints)
-    run = {"smooth": partial(solve, devices=devices, checkpoint=checkpoint), "exact": exact_penalty}[penalty]
+    carried = None if arm is None or arm.lumped is None else np.asarray(arm.lumped)
+    smooth = partial(solve, carried=carried, devices=devices, checkpoint=checkpoint)
+    run = {"smooth": smooth, "exact": exact_penalty}[penalty]
     found = run(A, b, boxes, constraints=constraints, starts=starts, seed=seed, progress=progress)
     feasible = found.violation == 0
     if not feasible.any() and penalty == "smooth":
@@ -277,29 +291,33 @@ def retrieve(
     phi, violation = found.phi[found.best], float(found.violation[found.best])
     nominal = None if arm is None else np.asarray(arm.standard)
     notes = _notes(table, found, weighting)
-    held, carrying = constraints, arm is not None and arm.lumped is not None
-    if nominal is not None and feasible.any() and penalty == "smooth" and (prefer == "nominal" or carrying):
+    if table.model is None and table.arm == "panda" and bounds is None:
+        notes.append("no model stands in the table: by its name it was taken for the Panda without hand")
+    if nominal is not None and feasible.any() and penalty == "smooth" and prefer == "nominal":
         room = CONCESSION * best + NOTHING * float(b @ b)
         if weighting == "torque" and table.evidence is not None and table.method == "trajectory":
             room += _conceded(table.evidence.whole.dof * table.evidence.whole.samples + best)
-        pulled = _towards(nominal, A, b, boxes, constraints, phi, room)
-        if arm is not None and carrying and not are_buildable(pulled - np.asarray(arm.lumped)):
-            further = (*constraints, less_lumped(np.asarray(arm.lumped)))
-            beside = _pulled(nominal, A, b, boxes, further, nominal, room)
-            if beside.violation[beside.best] == 0:
-                pulled, held = beside.phi[beside.best], further
-            else:
-                notes.append(
-                    "links that explain the torque leave no room for the bodies that the model fixes to them;"
-                    " does the recorded arm carry those?"
-                )
-        if prefer == "nominal" or held is not constraints:
-            phi, violation = pulled, 0.0
-            if room > 2 * CONCESSION * best:
-                notes.append(
-                    f"the torque error may be {100 * TORQUE_CONCESSION:g} % higher than it need be, for"
-                    " links nearer to the model's"
-                )
+        pulled = _towards(nominal, A, b, boxes, constraints, carried, phi, room)
+        phi, violation = pulled, 0.0
+        if room > 2 * CONCESSION * best:
+            notes.append(
+                f"the torque error may be {100 * TORQUE_CONCESSION:g} % higher than it need be, for links"
+                " nearer to the model's"
+            )
+    if carried is not None and arm is not None and penalty == "smooth":
+        known = 0.0  # squares that no links explain
+        if weighting == "torque" and table.evidence is not None:
+            known = float(table.evidence.whole.dof * table.evidence.whole.samples)
+        nothing = NOTHING * float(b @ b)
+        standard = np.asarray(arm.standard)
+        free = _pulled(standard, A, b, boxes, constraints, np.zeros_like(carried), phi, nothing)
+        less = known + float(np.sum((A @ free.phi[free.best].ravel() - b) ** 2)) + nothing
+        if known + best > _DOUBT**2 * less:
+            notes.append(
+                "links that explain the torque leave no room for the bodies that the model fixes to them, which"
+                f" makes the error {100 * (np.sqrt((known + best) / less) - 1):.0f} % higher: does the recorded"
+                " arm carry those?"
+            )
     if prefer != "nominal" or penalty != "smooth":
         nominal = None
     wanted = certificate is True or (
@@ -313,7 +331,9 @@ def retrieve(
         if weighting == "torque" and friction is not None:
             own = table.evidence.whole.following(table.projection @ phi.ravel(), least_friction(friction))
             friction = with_own_parameters(friction, own)
-        errors = _torque_errors(table, table.evidence, friction, boxes, held, phi, weighting, nominal)
+        errors = _torque_errors(
+            table, table.evidence, friction, boxes, constraints, carried, phi, weighting, nominal
+        )
     return Retrieval(
         standard=phi,
         objective=float(np.sum((A @ phi.ravel() - b) ** 2)),
@@ -331,9 +351,11 @@ def retrieve(
         run_seconds=found.run_seconds,
         link_names=names,
         arm=table.arm,
+        own=table.arm in ("", "panda") if table.model is None else is_panda(table.model),
         friction=friction,
         known=table.known,
         model_file=table.model_file,
+        model_part=table.model_part,
         **errors,
         warnings=tuple(doubts(phi, names, None if arm is None else reach(arm))),
         notes=tuple(notes),
@@ -399,6 +421,7 @@ def _towards(
     b: Float[np.ndarray, " rows"],
     bounds: Bounds,
     constraints: tuple[Constraint, ...],
+    carried: Float[np.ndarray, "dof 10"] | None,
     best: Float[np.ndarray, "dof 10"],
     room: float,
 ) -> Float[np.ndarray, "dof 10"]:
@@ -411,7 +434,7 @@ def _towards(
     objective = lambda phi: float(np.sum((A @ phi.ravel() - b) ** 2))
     scale = _scale(nominal, bounds)
     distance = lambda phi: float(np.sum(((phi - nominal) / scale) ** 2))
-    pulled = _pulled(nominal, A, b, bounds, constraints, best, room)
+    pulled = _pulled(nominal, A, b, bounds, constraints, carried, best, room)
     nearer = (
         (pulled.violation == 0)
         & np.array([objective(phi) <= objective(best) + room for phi in pulled.phi])
@@ -428,7 +451,7 @@ def _conceded(squares: float) -> float:
 def _scale(nominal: Float[np.ndarray, "dof 10"], bounds: Bounds) -> Float[np.ndarray, "dof 10"]:
     """In which distances from the nominal links count."""
     mass = np.maximum(nominal[:, :1], 0.1 * nominal[:, 0].mean())
-    size = np.linalg.norm(np.diff(bounds.com)[..., 0], axis=-1)[:, None]
+    size = np.maximum(np.linalg.norm(np.diff(bounds.com)[..., 0], axis=-1), _LEAST_SIZE)[:, None]
     return np.concatenate([mass, *[mass * size] * 3, *[mass * size**2] * 6], 1)
 
 
@@ -438,6 +461,7 @@ def _pulled(
     b: Float[np.ndarray, " rows"],
     bounds: Bounds,
     constraints: tuple[Constraint, ...],
+    carried: Float[np.ndarray, "dof 10"] | None,
     first: Float[np.ndarray, "dof 10"],
     room: float,
 ) -> Solutions:
@@ -449,6 +473,7 @@ def _pulled(
         np.concatenate([b, root * (nominal / scale).ravel()]),
         bounds,
         constraints=constraints,
+        carried=carried,
         initial=np.stack([first, nominal]),
         starts=2,
     )
@@ -460,6 +485,7 @@ def _torque_errors(
     friction: Friction | None,
     bounds: Bounds,
     constraints: tuple[Constraint, ...],
+    carried: Float[np.ndarray, "dof 10"] | None,
     phi: Float[np.ndarray, "dof 10"],
     weighting: str,
     nominal: Float[np.ndarray, "dof 10"] | None,
@@ -484,12 +510,12 @@ def _torque_errors(
         T = train.weigh(len(beta), sigma)
         A, b = T @ K, T @ estimate
         nothing = NOTHING * float(b @ b)
-        found = _pulled(phi if nominal is None else nominal, A, b, bounds, constraints, phi, nothing)
+        found = _pulled(phi if nominal is None else nominal, A, b, bounds, constraints, carried, phi, nothing)
         links = found.phi[found.best]
         if nominal is not None:
             left = train.residual(estimate, own) / sigma
             room = _conceded(float(left @ left) + float(np.sum((A @ links.ravel() - b) ** 2)))
-            links = _towards(nominal, A, b, bounds, constraints, links, room)
+            links = _towards(nominal, A, b, bounds, constraints, carried, links, room)
         squares += test.residual(K @ links.ravel(), train.following(K @ links.ravel(), least)) ** 2
     samples = sum(test.samples for _, test in evidence.folds)
     torque = float(np.linalg.norm([test.torque for _, test in evidence.folds]))
@@ -567,7 +593,11 @@ def _margins(
 
 def _active(margins: Mapping[str, Any], bounds: Bounds) -> list[str]:
     """Names of the constraints without slack; boxes that are points are not constraints."""
-    found = [f"triangle inequality of link {i + 1}" for i, m in enumerate(margins["triangle"]) if m <= ACTIVE]
+    found = [
+        f"triangle inequality of link {i + 1}"
+        for i, m in enumerate(margins["triangle"])
+        if m <= ACTIVE and bounds.mass[i, 1] > 0
+    ]
     rows = [margins["mass"], *zip(*margins["com"], strict=True), *zip(*margins["inertia"], strict=True)]
     named = [f"m{i + 1}" for i in range(bounds.dof)]
     named += [f"c{i + 1}{axis}" for axis in "xyz" for i in range(bounds.dof)]
@@ -577,6 +607,8 @@ def _active(margins: Mapping[str, Any], bounds: Bounds) -> list[str]:
         pairs.append(("total_mass", margins["total_mass"]))
     for name, pair in pairs:
         width = np.inf if None in pair else sum(pair)
+        if width <= _POINT:
+            continue
         close = ACTIVE * (width if np.isfinite(width) else 1.0)
         found += [
             f"{name} {end}"

@@ -42,12 +42,14 @@ from .export import dry_friction
 from .mjcf import (
     MjcfSource,
     com_from_standard,
+    file_with,
     from_mjcf,
     has_own_friction_law,
     move_standard,
     own_log,
     standard_from_com,
 )
+from .model_file import Model
 from .recordings import Recording
 from .recordings import load as load_recording
 from .signals import derivatives, prepare, zero_phase
@@ -129,7 +131,7 @@ def replay(
     diagnosis: str | Path | Corrected,
     recording: str | Path | Recording,
     *,
-    model: str | Path | MjcfSource | None = None,
+    model: Model | MjcfSource | None = None,
     engine: Engine = "mujoco",
     seconds: float = SECONDS,
     start: float | None = None,
@@ -200,7 +202,7 @@ def compare(
 
 
 def compare_files(
-    diagnosis: str | Path, model: str | Path, recording: str | Path, *, seconds: float = SECONDS
+    diagnosis: str | Path, model: Model, recording: str | Path, *, seconds: float = SECONDS
 ) -> dict[str, Any]:
     """`compare`, from the folder that `diagnose` wrote, the user's MJCF and a recording."""
     corrected, source = _opened(diagnosis, model)
@@ -326,7 +328,7 @@ def stable(gains: Gains, recording: Recording, arm: Arm, dt: float) -> Gains:
 
 def _opened(
     diagnosis: str | Path | Corrected,
-    model: str | Path | MjcfSource | None,
+    model: Model | MjcfSource | None,
     effects: Sequence[type[AbstractEffect]] = (),
 ) -> tuple[Corrected, MjcfSource]:
     if isinstance(diagnosis, Corrected):
@@ -335,7 +337,7 @@ def _opened(
         corrected = diagnosis
     else:
         corrected = read(diagnosis, effects)[0]
-        model = Path(diagnosis) / XML if model is None else model
+        model = file_with(corrected.arm, Path(diagnosis) / XML) if model is None else model
     return corrected, model if isinstance(model, MjcfSource) else from_mjcf(model)[1]
 
 

@@ -32,9 +32,11 @@ from jaxtyping import Array, Float
 
 from . import files
 from .arm import Arm
+from .engine_log import own_log
 from .errors import InputError, require_x64
 from .friction import Friction
-from .mjcf import MjcfSource, from_mjcf, own_log
+from .mjcf import MjcfSource, from_mjcf
+from .model_file import Model
 from .recordings import Recording
 from .signals import Signals, derivatives, prepare, zero_phase
 
@@ -167,7 +169,7 @@ def _rollout_json(rollout: Rollout | None) -> dict[str, Any] | None:
 
 
 def validate(
-    model: str | Path,
+    model: Model,
     recordings: Sequence[Recording],
     *,
     cutoff: float = 5.0,

@@ -26,6 +26,7 @@ from jaxpanda.errors import InputError
 from jaxpanda.export import write_document
 from jaxpanda.files import write_json
 from jaxpanda.mjcf import from_mjcf
+from jaxpanda.model_file import ModelFile, Part
 from jaxpanda.recordings import load, save
 
 ARM = '<body><joint axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
@@ -80,13 +81,17 @@ def test_an_export_replaces_no_model_of_the_user_s(tmp_path, name):
 
 
 def test_what_is_included_from_outside_is_written_inside(tmp_path):
-    """It was written beside `--out`."""
+    """It was written beside `--out`; and nothing outside is read unless that is allowed."""
     (tmp_path / "in").mkdir()
     (tmp_path / "common.xml").write_text(f"<mujoco><worldbody>{ARM}</worldbody></mujoco>")
     (tmp_path / "in" / "arm.xml").write_text(
         '<mujoco>\n  <include file="../common.xml"/> <!-- ours -->\n</mujoco>'
     )
-    _, source = from_mjcf(tmp_path / "in" / "arm.xml")
+    with pytest.raises(
+        InputError, match=r"line 2: includes '\.\./common\.xml', which lies outside .* --outside"
+    ):
+        from_mjcf(tmp_path / "in" / "arm.xml")
+    _, source = from_mjcf(ModelFile(tmp_path / "in" / "arm.xml", Part(outside=True)))
     write_document(source.document, tmp_path / "a" / "out" / "new.xml")
     assert sorted(p.name for p in (tmp_path / "a").rglob("*")) == ["common.xml", "new.xml", "out"]
     np.testing.assert_array_equal(from_mjcf(tmp_path / "a" / "out" / "new.xml")[1].standard, source.standard)

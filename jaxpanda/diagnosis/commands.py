@@ -15,6 +15,7 @@ from ..corrected import KIND, XML, read
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_file, output_folder, write_text
+from ..model_file import Model
 from ..reading import Reading
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
@@ -56,7 +57,7 @@ class Prediction:
 @on_host
 def diagnose_files(
     out: Path,
-    model: Path | None,
+    model: Model | None,
     recordings: Sequence[Path],
     reference: Sequence[Path],
     knowledge: Knowledge,
@@ -83,7 +84,7 @@ def diagnose_files(
             gravity=convention.mounting,
             progress=lambda line: say(plainly(line)),
         )
-        given = [("model", p) for p in [model] if p]
+        given = [("model", Path(p)) for p in [model] if p]
         given += [("recording", p) for p in recordings] + [("reference", p) for p in reference]
         names = {r.path: r.name for r in every}
         sources = tuple(_source(role, path, names) for role, path in given)

@@ -27,6 +27,7 @@ from ..export import (
 )
 from ..feasible.nearest import are_buildable, nearest_buildable
 from ..mjcf import MjcfSource, from_document, from_mjcf, with_gravity
+from ..model_file import Model
 from ..recordings import Recording, distinct, load
 from ..session import Say, silent
 from . import knowledge as knowledge_
@@ -169,7 +170,7 @@ class Diagnosis:
 
 @on_host
 def diagnose(
-    model: str | Path | None,
+    model: Model | None,
     recordings: Sequence[str | Path | Recording],
     *,
     reference: Sequence[str | Path | Recording] = (),

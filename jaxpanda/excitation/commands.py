@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import Any
 
 from ..files import output_folder
+from ..model_file import Model
 from ..session import progress
 from .excite import excite
 from .result import KIND, Excitation
 
 
 def excite_files(
-    out: Path, model: Path | None, limits: Mapping[str, Sequence[float]], **options: Any
+    out: Path, model: Model | None, limits: Mapping[str, Sequence[float]], **options: Any
 ) -> Excitation:
     """`jaxpanda excite`."""
     with output_folder(out, KIND) as folder, progress("designing the motion") as tick:

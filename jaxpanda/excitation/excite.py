@@ -17,6 +17,7 @@ from ..friction import LINEAR
 from ..identification import Identification
 from ..markup import parse
 from ..mjcf import MjcfSource, from_document, from_mjcf
+from ..model_file import Model
 from ..parameters import Base, arm_base_parameters
 from ..simulation import FourierTrajectory
 from .design import FRICTION, Criterion, Fourier, Task, friction_columns, gram, rows, solve, starts
@@ -44,7 +45,7 @@ _UNTOLD = 0.01
 
 
 def excite(
-    model: str | Path | None = None,
+    model: Model | None = None,
     *,
     seconds: float = 20.0,
     rate: float = 1000.0,

@@ -22,8 +22,9 @@ from jaxpanda_kernels import Chain, link_poses
 from jaxtyping import Array, Float, Int
 
 from ..arm import Arm
+from ..engine_log import own_log
 from ..errors import InputError
-from ..mjcf import MjcfSource, own_log, with_shapes
+from ..mjcf import MjcfSource, with_shapes
 from .limits import is_franka_panda, published
 
 _POSES = 300

@@ -26,7 +26,8 @@ class Bounds:
 
     Raises:
         InputError: a bound is not a number, a lower one exceeds its upper one, masses or centres of mass
-            are not bounded (random starts are drawn inside the box), or no mass above zero is allowed.
+            are not bounded (random starts are drawn inside the box), or a link may have no mass, unless both
+            bounds say that it has none.
     """
 
     mass: Float[np.ndarray, "dof 2"]
@@ -47,7 +48,7 @@ class Bounds:
                 )
             if not name.startswith("I") and not (np.isfinite(lower) and np.isfinite(upper)):
                 raise InputError(f"bounds of {name}: [{lower:g}, {upper:g}] must be finite")
-            if name.startswith("m") and upper <= 0:
+            if name.startswith("m") and upper <= 0 and (lower, upper) != (0, 0):  # a link that has none
                 raise InputError(
                     f"bounds of {name}: the upper bound {upper:g} kg leaves no mass; give a positive one"
                 )
@@ -123,8 +124,9 @@ class Bounds:
     def around(cls, arm: Arm) -> "Bounds":
         """Bounds for an arm without published ones, from its nominal parameters and its geometry.
 
-        Mass: a fifth to three times the nominal one (at least up to 0.1 kg). Centre of mass: the box around
-        the link's own joint, the next joint and the nominal centre of mass, widened by 0.05 m and a quarter
+        Mass: a fifth to three times the nominal one (at least up to 0.1 kg; none for a link that has none).
+        Centre of mass: the box around the link's own joint, the next joint and the nominal centre of mass,
+        widened by 0.05 m and a quarter
         of its size. Inertia: what the largest mass at the box's corners would have (at least twice the
         nominal one). Total mass: nominal within 25 %. Wide on purpose: they keep the starts near the arm,
         they are not knowledge about it.
@@ -136,7 +138,7 @@ class Bounds:
         low, high = corners.min(0), corners.max(0)
         margin = 0.05 + 0.25 * (high - low)
         low, high = low - margin, high + margin
-        heaviest = np.maximum(3 * mass, 0.1)
+        heaviest = np.where(mass == 0, 0.0, np.maximum(3 * mass, 0.1))  # between two joints of one body
         nominal = np.abs(I_com).max((1, 2))
         largest = np.maximum(heaviest * np.sum((high - low) ** 2, -1), 2 * nominal)
         return cls(

@@ -47,12 +47,12 @@ def doubts(standard: Float[np.ndarray, "dof 10"], names: Sequence[str], length: 
     mass, _, I_com = (np.asarray(x) for x in jax.vmap(inertia.to_com)(jnp.asarray(standard)))
     said, thin = [], []
     for name, m, I in zip(names, mass, I_com, strict=True):
+        if m == 0:  # the link between two joints of one body
+            continue
         if m < LIGHTEST * mass.sum():
             said.append(
                 f"{name} weighs {_mass(m)}, {100 * m / mass.sum():.2g} % of the arm: too light for any drive"
             )
-        if m <= 0:
-            continue
         radius = (3 * m / (4 * np.pi * DENSEST)) ** (1 / 3)
         mean, least = np.trace(I) / 3, np.linalg.eigvalsh(I)[0]
         gyration = np.sqrt(max(np.trace(I) / 2 / m, 0.0))

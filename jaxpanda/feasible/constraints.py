@@ -113,16 +113,15 @@ def mass_in_ellipsoid(link: int, centre: Points, semi_axes: Points) -> Constrain
     return margin
 
 
-def less_lumped(lumped: Float[np.ndarray, "dof 10"]) -> Constraint:
+def less_lumped(lumped: Float[np.ndarray, "dof 10"] | Float[Array, "dof 10"]) -> Constraint:
     """What is left of every link is a body when those that are fixed to it are taken off.
 
     The margins are the least eigenvalues of the pseudo-inertias of what is left [kg m², kg].
     """
-    carrying = np.flatnonzero(np.any(lumped != 0, axis=1))
 
-    def margins(links: Links) -> Float[Array, " carrying"]:
-        own = (links.phi - lumped)[carrying]
-        return jax.vmap(lambda phi: jnp.linalg.eigvalsh(inertia.pseudo_inertia(phi))[0])(own)
+    def margins(links: Links) -> Float[Array, " dof"]:
+        least = jax.vmap(lambda phi: jnp.linalg.eigvalsh(inertia.pseudo_inertia(phi))[0])(links.phi - lumped)
+        return jnp.where(jnp.any(lumped != 0, axis=1), least, jnp.inf)
 
     return margins
 

@@ -63,11 +63,12 @@ def scaled_problem(
     extra_lower: Float[np.ndarray, " extra"] | None,
     extra_upper: Float[np.ndarray, " extra"] | None,
     constraints: tuple[Constraint, ...] = (),
+    carried: Float[np.ndarray, "dof 10"] | None = None,
 ) -> Problem:
     """Check the input and scale it; only where `suits`."""
     dof = bounds.dof
     low, high = extra_box(A, b, bounds, extra_lower, extra_upper)
-    mass, com = _inset(_masses(bounds)), _inset(bounds.com)
+    mass, com = _inset(_masses(bounds, carried)), _inset(bounds.com)
     inertia_box = _beyond_the_triangle(bounds.inertia)
     unit = _units(A, b, bounds, inertia_box)
     centre = bounds.com.mean(-1)
@@ -102,6 +103,7 @@ def scaled_problem(
         d=jnp.asarray(d),
         to_phi=jnp.asarray(to_phi),
         shift=jnp.asarray(TRIANGLE_INSET / (unit[:, 0] * unit[:, 1] ** 2)),
+        carried=jnp.asarray(_carried(to_phi, carried)),
         unit=jnp.asarray(unit),
         centre=jnp.asarray(centre),
         extra_unit=jnp.asarray(of_extra),
@@ -109,7 +111,7 @@ def scaled_problem(
         mass_box=jnp.asarray(mass / unit[:, :1]),
         com_box=jnp.asarray((com - centre[..., None]) / unit[:, 1:, None]),
         total_box=jnp.asarray(np.array([-np.inf, np.inf]) if total is None else total),
-        limits=limits_of(bounds, constraints),
+        limits=limits_of(bounds, constraints, carried),
         inertia_box=jnp.asarray(inertia_box / missed_in[:, None, None]),
         inset=jnp.asarray(inertia_inset(bounds) / missed_in[:, None])[..., None, None],
         inertia_unit=jnp.asarray(size / missed_in),
@@ -179,18 +181,30 @@ def _of_entries(
     return np.einsum("rli,lij->rlj", A[:, : 10 * dof].reshape(-1, dof, 10), to_phi).reshape(len(A), -1)
 
 
-def suits(bounds: Bounds, extra: Float[np.ndarray, "extra 2"]) -> bool:
+def _carried(
+    to_phi: Float[np.ndarray, "dof 10 10"], carried: Float[np.ndarray, "dof 10"] | None
+) -> Float[np.ndarray, "dof 10"]:
+    """Scaled entries of the bodies that links carry."""
+    if carried is None:
+        return np.zeros(to_phi.shape[:2])
+    return np.linalg.solve(to_phi, carried[..., None])[..., 0]
+
+
+def suits(
+    bounds: Bounds, extra: Float[np.ndarray, "extra 2"], carried: Float[np.ndarray, "dof 10"] | None = None
+) -> bool:
     """Whether every box has an inside."""
-    mass = _masses(bounds)
+    mass = _masses(bounds, carried)
     boxes = [mass, bounds.com.reshape(-1, 2), extra]
     if any(np.any(box[:, 1] - box[:, 0] <= 1e3 * _BOX_INSET) for box in boxes):
         return False
     return bounds.total_mass is None or _total_mass(bounds, _inset(mass)) is not None
 
 
-def _masses(bounds: Bounds) -> Float[np.ndarray, "dof 2"]:
+def _masses(bounds: Bounds, carried: Float[np.ndarray, "dof 10"] | None) -> Float[np.ndarray, "dof 2"]:
+    least = _LEAST_MASS + (0.0 if carried is None else carried[:, 0])
     return np.stack(
-        [np.minimum(np.maximum(bounds.mass[:, 0], _LEAST_MASS), bounds.mass[:, 1]), bounds.mass[:, 1]], -1
+        [np.minimum(np.maximum(bounds.mass[:, 0], least), bounds.mass[:, 1]), bounds.mass[:, 1]], -1
     )
 
 
@@ -354,7 +368,10 @@ def _random_start(problem: Problem, key: Key[Array, ""]) -> Float[Array, " colum
 
 def _given_start(problem: Problem, phi: Float[Array, "dof 10"]) -> Float[Array, " columns"]:
     """The real body inside the boxes that is near to a given one."""
-    mass, com, I_com = jax.vmap(inertia.to_com)(phi)
+    mass, com, _ = jax.vmap(inertia.to_com)(phi)
+    own = phi - jnp.einsum("lpq,lq->lp", problem.to_phi, problem.carried)
+    own = jnp.where(own[:, :1] > 0, own, phi)
+    I_com = jax.vmap(inertia.to_com)(own)[2]
     values, vectors = jnp.linalg.eigh(jax.vmap(inertia.second_moment)(I_com))
     Sigma = (vectors * jnp.maximum(values, 0.0)[:, None]) @ jnp.swapaxes(vectors, 1, 2)
     unit, length = problem.unit[:, 0], problem.unit[:, 1:]
@@ -392,12 +409,13 @@ def _interior(
     mass = mass + way * (end - mass)
     m = mass[:, None, None]
     Sigma = Sigma + (2 * share * m + problem.shift[:, None, None]) * jnp.eye(3)
-    S = jnp.concatenate([Sigma + m * com[:, :, None] * com[:, None], m * com[:, :, None]], 2)
-    S = jnp.concatenate([S, jnp.concatenate([m * com[:, None], m], 2)], 1)
+    m, h = m - problem.carried[:, MASS, None, None], mass[:, None] * com - problem.carried[:, np.array(FIRST)]
+    S = jnp.concatenate([Sigma + h[:, :, None] * h[:, None] / m, h[:, :, None]], 2)
+    S = jnp.concatenate([S, jnp.concatenate([h[:, None], m], 2)], 1)
     low, high = problem.extra_box.T
     width = jnp.where(jnp.isfinite(high - low), high - low, 1.0)
     extra = jnp.clip(0.0, low + 0.5 * share * width, high - 0.5 * share * width)
-    u = jnp.stack([S[:, i, k] for i, k in small.PAIRS], 1)
+    u = jnp.stack([S[:, i, k] for i, k in small.PAIRS], 1) + problem.carried
     return jnp.concatenate([u.ravel(), extra])
 
 

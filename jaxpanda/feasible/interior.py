@@ -2,8 +2,9 @@ r"""Interior-point steps of many starts at once: arrays with the starts ("lanes"
 
 $$\min_u\ \lVert Au - b\rVert^2 + P(u) \quad\text{subject to}\quad S_l(u) \succ 0,\quad s(u) = Gu + d > 0$$
 
-$S_l$ is link $l$'s pseudo-inertia (linear in $u$), $G$ holds the boxes and the total mass, $P$ the augmented
-Lagrangian of what is not linear in $u$: boxes on inertias about the centre of mass, and the user's constraints.
+$S_l$ is link $l$'s pseudo-inertia (linear in $u$) less that of the bodies it carries, $G$ holds the boxes and
+the total mass, $P$ the augmented Lagrangian of what is not linear in $u$: boxes on inertias about the centre of
+mass, and the user's constraints.
 
 **Path.** Primal and dual, $S Z = \mu 1$ and $s z = \mu$, with
 
@@ -66,6 +67,8 @@ class Problem(eqx.Module):
     """From u of a link to phi."""
     shift: Float[Array, " dof"]
     """Subtracted from the diagonal of Sigma in S: how far from the boundary to stay."""
+    carried: Float[Array, "dof 10"]
+    """Entries of what belongs to bodies that a link carries and that stay as they are: S is that of the rest."""
     unit: Float[Array, "dof 2"]
     """Unit of mass [kg] and length [m] of each link."""
     centre: Float[Array, "dof 3"]
@@ -126,9 +129,9 @@ class State(AbstractSteps):
 
 
 def matrices(problem: Problem, u: Float[Array, "columns lanes"]) -> small.Matrices:
-    """S of every link."""
+    """S of every link, less what it carries."""
     inset = jnp.asarray(np.diag([1.0, 1.0, 1.0, 0.0]))[:, :, None] * problem.shift[:, None, None, None]
-    return small.symmetric(of_links(problem, u)) - inset
+    return small.symmetric(of_links(problem, u) - problem.carried[..., None]) - inset
 
 
 def of_links(problem: Problem, u: Float[Array, "columns lanes"]) -> Float[Array, "dof 10 lanes"]:

@@ -7,12 +7,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..errors import InputError
 from .bounds import Bounds
-from .constraints import Constraint, Links, triangle_inequality
+from .constraints import Constraint, Links, less_lumped, triangle_inequality
 
 # The order xx, yy, zz, xy, xz, yz of tables.
 XYZ_ROW = np.array([0, 1, 2, 0, 0, 1])
 XYZ_COLUMN = np.array([0, 1, 2, 1, 2, 2])
 XYZ_MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+ROUNDING = 1e-12
+"""Share of a number by which it may miss its box: masses, centres and inertias are computed from phi."""
 TRIANGLE_INSET = 1e-8
 """How far from the triangle inequality's boundary to stay [kg m²]."""
 
@@ -83,15 +85,22 @@ class Limits(eqx.Module):
     inertia: Float[Array, "dof 6 2"]
     total_mass: Float[Array, " 2"]
     constraints: tuple[Constraint, ...] = eqx.field(static=True)
+    carried: Float[Array, "dof 10"] | None = None
+    """Of each link, what belongs to bodies that stay as they are: the rest must be a body too."""
 
 
-def limits_of(bounds: Bounds, constraints: tuple[Constraint, ...]) -> Limits:
+def limits_of(
+    bounds: Bounds,
+    constraints: tuple[Constraint, ...],
+    carried: Float[np.ndarray, "dof 10"] | None = None,
+) -> Limits:
     return Limits(
         mass=jnp.asarray(bounds.mass),
         com=jnp.asarray(bounds.com),
         inertia=jnp.asarray(bounds.inertia),
         total_mass=jnp.asarray([-np.inf, np.inf] if bounds.total_mass is None else bounds.total_mass),
         constraints=constraints,
+        carried=None if carried is None else jnp.asarray(carried),
     )
 
 
@@ -100,15 +109,22 @@ def largest_violation(limits: Limits, phi: Float[Array, "dof 10"]) -> Float[Arra
     links = Links.from_phi(phi)
     of_I = links.I_com[:, XYZ_ROW, XYZ_COLUMN]
     total = jnp.sum(links.mass)
+    of_origin = ROUNDING * jnp.max(jnp.abs(phi[:, 4:]), 1)  # what I_com is the difference of
     boxes = (
-        (links.mass, limits.mass),
-        (links.com, limits.com),
-        (of_I, limits.inertia),
-        (total, limits.total_mass),
+        (links.mass, limits.mass, ROUNDING * links.mass),
+        (links.com, limits.com, ROUNDING),
+        (of_I, limits.inertia, of_origin[:, None]),
+        (total, limits.total_mass, ROUNDING * total),
     )
-    margins = [margin for value, box in boxes for margin in (value - box[..., 0], box[..., 1] - value)]
+    margins = [
+        margin
+        for value, box, least in boxes
+        for margin in (value - box[..., 0] + least, box[..., 1] - value + least)
+    ]
     margins += [constraint(links) for constraint in limits.constraints]
-    margins += [triangle_inequality(links)]
+    margins += [triangle_inequality(links) + of_origin]
+    if limits.carried is not None:
+        margins += [less_lumped(limits.carried)(links)]
     least = jnp.min(jnp.stack([jnp.min(margin, initial=jnp.inf) for margin in margins]))
     return jnp.where(jnp.isfinite(phi).all(), jnp.maximum(0.0, -least), jnp.inf)
 

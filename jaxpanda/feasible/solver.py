@@ -17,12 +17,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.optimize import lsq_linear
 
 from ..errors import InputError, require_x64
 from . import convex, newton, projection, schedule
 from .bounds import Bounds
 from .checkpoint import Checkpoint, identity
-from .constraints import Constraint
+from .constraints import Constraint, less_lumped
+from .known import Known, require_numbers
 from .outcome import extra_box
 
 STARTS = 2048
@@ -77,6 +79,7 @@ def solve(
     bounds: Bounds,
     *,
     constraints: Sequence[Constraint] = (),
+    carried: Float[np.ndarray, "dof 10"] | None = None,
     extra_lower: Float[np.ndarray, " extra"] | None = None,
     extra_upper: Float[np.ndarray, " extra"] | None = None,
     initial: Float[np.ndarray, "given dof 10"] | None = None,
@@ -94,8 +97,10 @@ def solve(
     Args:
         A: one row an equation; columns are the ten parameters of each link in turn, then the extra unknowns.
         b: right-hand side.
-        bounds: boxes, from which the random starts are drawn as well.
+        bounds: boxes, from which the random starts are drawn as well; points where a number is known.
         constraints: further ones, as functions of `Links`.
+        carried: of each link, what belongs to bodies that are fixed to it and stay as they are: the rest must
+            be a body that can be built, too.
         extra_lower: lower bounds of the extra unknowns; unbounded where None.
         extra_upper: upper bounds of the extra unknowns; unbounded where None.
         initial: parameters to start from in place of as many random starts; moved into the boxes.
@@ -112,18 +117,122 @@ def solve(
         progress: called with (starts done, starts) after every chunk.
 
     Raises:
-        InputError: shapes do not fit each other, a number is not finite, or the checkpoint is of another problem.
+        InputError: shapes do not fit each other, a number is not finite, a constraint is no number, bodies
+            that are carried outweigh a bound, or the checkpoint is of another problem.
     """
     require_x64("feasible.solve")
     if starts < 1:
         raise InputError(f"starts: {starts} is too few; at least 1")
     constraints = tuple(constraints)
+    require_numbers(constraints, bounds)
+    _require_room(bounds, carried)
+    known = Known.of(bounds)
+    if not known.nothing:
+        low, high = extra_box(A, b, bounds, extra_lower, extra_upper)
+        if not len(known.free):
+            return _all_known(A, b, known, low, high, constraints, starts)
+        columns = np.concatenate([np.arange(10) + 10 * link for link in known.free])
+        further = np.arange(10 * bounds.dof, A.shape[1])
+        found = _solve(
+            A[:, np.concatenate([columns, further]).astype(int)],
+            b - A[:, : 10 * bounds.dof] @ known.phi.ravel(),
+            known.reduced(),
+            tuple(known.constraint(one) for one in constraints),
+            known.carried(carried),
+            extra_lower,
+            extra_upper,
+            None if initial is None else initial[:, known.free],
+            starts,
+            seed,
+            chunk,
+            rounds,
+            iterations,
+            devices,
+            checkpoint,
+            progress,
+        )
+        phi, violation = known.settled(found.phi, constraints)
+        return dataclasses.replace(
+            found,
+            phi=phi,
+            objective=_objectives(A, b, phi, found.extra),
+            violation=violation,
+            converged=found.converged & (violation == 0),
+        )
+    return _solve(
+        A,
+        b,
+        bounds,
+        constraints,
+        carried,
+        extra_lower,
+        extra_upper,
+        initial,
+        starts,
+        seed,
+        chunk,
+        rounds,
+        iterations,
+        devices,
+        checkpoint,
+        progress,
+    )
+
+
+def _all_known(
+    A: Float[np.ndarray, "rows columns"],
+    b: Float[np.ndarray, " rows"],
+    known: Known,
+    low: Float[np.ndarray, " extra"],
+    high: Float[np.ndarray, " extra"],
+    constraints: tuple[Constraint, ...],
+    starts: int,
+) -> Solutions:
+    """Every start is the links that are known; what is unknown beside them is linear."""
+    n, extra = 10 * known.bounds.dof, np.zeros(len(low))
+    if len(extra):
+        extra = lsq_linear(A[:, n:], b - A[:, :n] @ known.phi.ravel(), (low, high)).x
+    phi, violation = known.settled(np.zeros((starts, 0, 10)), constraints)
+    extra = np.tile(extra, (starts, 1))
+    none = np.zeros(starts, int)
+    return Solutions(phi, extra, _objectives(A, b, phi, extra), violation, violation == 0, none, 0.0, 0.0)
+
+
+def _require_room(bounds: Bounds, carried: Float[np.ndarray, "dof 10"] | None) -> None:
+    if carried is None:
+        return
+    for i in np.flatnonzero((carried[:, 0] > 0) & (bounds.mass[:, 1] <= carried[:, 0])):
+        raise InputError(
+            f"bounds of m{i + 1}: at most {bounds.mass[i, 1]:g} kg, but bodies that the model fixes to that link"
+            f" weigh {carried[i, 0]:g} kg; raise the bound"
+        )
+
+
+def _solve(
+    A: Float[np.ndarray, "rows columns"],
+    b: Float[np.ndarray, " rows"],
+    bounds: Bounds,
+    constraints: tuple[Constraint, ...],
+    carried: Float[np.ndarray, "dof 10"] | None,
+    extra_lower: Float[np.ndarray, " extra"] | None,
+    extra_upper: Float[np.ndarray, " extra"] | None,
+    initial: Float[np.ndarray, "given dof 10"] | None,
+    starts: int,
+    seed: int,
+    chunk: int | None,
+    rounds: int,
+    iterations: int,
+    devices: Sequence[schedule.Device] | None,
+    checkpoint: str | Path | None,
+    progress: Callable[[int, int], None] | None,
+) -> Solutions:
+    """`solve` where no box is a point."""
     extra = np.stack(extra_box(A, b, bounds, extra_lower, extra_upper), -1)
     device = (jax.local_devices() if devices is None else devices)[0]
     further = (extra_lower, extra_upper)
 
     def along_the_path() -> _Way:
-        problem = convex.scaled_problem(A, b, bounds, *further, constraints)
+        problem = convex.scaled_problem(A, b, bounds, *further, constraints, carried)
         kind = "cpu" if device.platform == "cpu" else "gpu"
         options = rounds * iterations, convex.LANES[kind]
         return _Way(
@@ -131,7 +240,8 @@ def solve(
         )
 
     def by_newton() -> _Way:
-        problem = newton.scaled_problem(A, b, bounds, constraints, *further)
+        held = constraints if carried is None else (*constraints, less_lumped(carried))
+        problem = newton.scaled_problem(A, b, bounds, held, *further)
         origin = newton.origin_of(problem, bounds, seed, initial)
         return _Way(newton.solve_starts, origin, (rounds, iterations), min(newton.CHUNK, starts))
 
@@ -155,7 +265,7 @@ def solve(
         """How many of a few starts converged, to an objective of no more than this."""
         return float(np.mean(tried.converged & (_objectives(A, b, tried.phi, tried.extra) <= most)))
 
-    way, few = along_the_path() if convex.suits(bounds, extra) else by_newton(), min(starts, _TRIED)
+    way, few = along_the_path() if convex.suits(bounds, extra, carried) else by_newton(), min(starts, _TRIED)
     if way.solve_starts is convex.solve_starts:
         nothing, exact = NOTHING * float(b @ b), projected(way)
         tried = go(way, few) if constraints or exact is not None else None
@@ -166,7 +276,7 @@ def solve(
     kept = None
     if checkpoint is not None:
         kept = Checkpoint(
-            checkpoint, identity(A, b, bounds, constraints, (*further, initial), seed, way.options)
+            checkpoint, identity(A, b, bounds, constraints, (*further, initial, carried), seed, way.options)
         )
     found = go(way, starts, checkpoint=kept, progress=progress)
     compile_seconds, run_seconds = np.sum(seconds, 0).tolist()

@@ -35,6 +35,8 @@ class Prior:
     phi: Float[np.ndarray, "dof 10"]
     std: Float[np.ndarray, "dof 10"]
     """[kg, kg m, kg m²]; infinite for no expectation."""
+    carried: Float[np.ndarray, "dof 10"] | None = None
+    """Of the links, what belongs to bodies that are fixed to them and stay as they are."""
 
     @classmethod
     def around(cls, arm: Arm, bounds: Bounds, width: float = PRIOR) -> "Prior":
@@ -43,7 +45,8 @@ class Prior:
         mass = np.maximum(phi[:, 0], _LIGHT * phi[:, 0].mean())
         radius = 0.5 * np.linalg.norm(bounds.com[..., 1] - bounds.com[..., 0], axis=-1)
         std = width * mass[:, None] * radius[:, None] ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
-        return cls(phi, np.where(std > 0, std, np.inf))
+        carried = None if arm.lumped is None else np.asarray(arm.lumped)
+        return cls(phi, np.where(std > 0, std, np.inf), carried)
 
 
 def feasible_least_squares(
@@ -86,6 +89,7 @@ def feasible_least_squares(
         b,
         bounds,
         constraints=constraints,
+        carried=prior.carried,
         extra_lower=low,
         extra_upper=high,
         initial=prior.phi[None],

@@ -13,6 +13,7 @@ from ..errors import InputError
 from ..files import Kind, finite, output_folder, settle, write_json
 from ..friction import Friction
 from ..inputs import digest, read_json
+from ..model_file import WHOLE, Part
 from ..parameters import coefficient_matrix, expression, linear_forms
 from .condensed import FILE as EVIDENCE_FILE
 from .condensed import Evidence
@@ -77,6 +78,8 @@ class Identification:
     """The arm as it was before, with its nominal parameters."""
     model_file: str = ""
     """The MJCF that it was read from, where that is known."""
+    model_part: Part = WHOLE
+    """Which arm of that file it is."""
     link_names: tuple[str, ...] = ()
     joint_names: tuple[str, ...] = ()
     recordings: tuple[str, ...] = ()
@@ -120,6 +123,7 @@ class Identification:
             "arm": self.arm,
             "model": None if self.model is None else self.model.to_json(),
             "model_file": self.model_file or None,
+            "model_part": self.model_part.to_json(),
             "rank": self.rank,
             "condition_number": self.condition_number,
             "relative_error_percent": self.relative_error_percent,
@@ -226,6 +230,7 @@ class Identification:
             arm=str(read.get("arm", "")),
             model=_model(read.table("model"), dof, where),
             model_file=str(read.get("model_file", "")),
+            model_part=Part.from_json(read.get("model_part", None)),
             link_names=links,
             joint_names=joints,
             recordings=read.names("recordings"),

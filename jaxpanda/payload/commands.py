@@ -8,6 +8,7 @@ from ..convention import PLAIN, Convention
 from ..errors import InputError
 from ..export import missing_assets
 from ..files import output_folder
+from ..model_file import Model
 from ..reading import Reading
 from ..recordings import load_many
 from .estimate import estimate_payload
@@ -16,7 +17,7 @@ from .result import KIND, MODEL_XML, PayloadEstimate
 
 def payload_files(
     out: Path,
-    model: Path | None,
+    model: Model | None,
     without: Sequence[Path],
     loaded: Sequence[Path],
     *,

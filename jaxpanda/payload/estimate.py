@@ -22,6 +22,7 @@ from ..export import panda_mjcf
 from ..identification import statistics
 from ..markup import parse
 from ..mjcf import from_document, from_mjcf, with_gravity
+from ..model_file import Model
 from ..recordings import Recording, distinct
 from .design import CHANGE, SLOW, Design, Sampled, Scales, design, sample
 from .frame import frame_of
@@ -51,7 +52,7 @@ class Posterior:
 
 
 def estimate_payload(
-    model: str | Path | None,
+    model: Model | None,
     without: Sequence[Recording],
     loaded: Sequence[Recording],
     *,
