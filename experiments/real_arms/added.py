@@ -14,9 +14,15 @@ from reference import Log, inner, motion, shifted
 FAST = 20.0
 """What additions are computed from holds frequencies up to this [Hz]."""
 FRICTION = (
-    "coulomb_friction viscous_friction asymmetric_friction stribeck_friction presliding_hysteresis "
-    "power_law_friction load_dependent_friction friction_drift"
-).split()
+    "coulomb_friction",
+    "viscous_friction",
+    "asymmetric_friction",
+    "stribeck_friction",
+    "presliding_hysteresis",
+    "power_law_friction",
+    "load_dependent_friction",
+    "friction_drift",
+)
 
 
 def other_friction(name):
@@ -107,9 +113,12 @@ def coulomb(n, j):
 def viscous(n, j):
     form = lambda log, s: s * one(n, j, _speed(log, j))
     return Added(
-        "viscous_friction", [j], form, lambda s: [number("damping", j, s, "N·m·s/rad")],
+        "viscous_friction",
+        [j],
+        form,
+        lambda s: [number("damping", j, s, "N·m·s/rad")],
         also=("power_law_friction",),
-    )  # fmt: skip
+    )
 
 
 def stribeck(n, j, rise, speed):
@@ -140,7 +149,7 @@ def asymmetric(n, j, ratio):
 
 
 def hysteresis(n, j, distance):
-    """Dahl's bristle: z' = v (1 - sgn(v) z), over a distance [rad]; exact between two samples of constant speed."""
+    """Dahl's bristle, z' = v (1 - sgn(v) z) / distance [rad]; exact where speed keeps its sign for a sample."""
 
     def form(log, s):
         q = motion(log, FAST)[0][:, j - 1]
@@ -275,6 +284,11 @@ def contact(chain, link, point, direction, interval, ramp=0.15):
         + [number(f"direction_{axis}", link, x, "1") for axis, x in zip("xyz", direction, strict=True)]
     )
     return Added(
-        "external_contact", [link], form, told, lasts=False, intervals=[[float(start), float(stop)]],
+        "external_contact",
+        [link],
+        form,
+        told,
+        lasts=False,
+        intervals=[[float(start), float(stop)]],
         also=("payload_change",),
-    )  # fmt: skip
+    )

@@ -1,6 +1,7 @@
 """A serial arm in numpy: inverse dynamics as a regressor, and its MJCF. Shares no code with jaxpanda.
 
-Ten numbers a link, about the joint's frame: mass [kg], first moment (3) [kg m], inertia xx yy zz xy xz yz [kg m²].
+Ten numbers a link, about the joint's frame: mass [kg], first moment (3) [kg m], inertia xx yy zz xy xz yz
+[kg m²].
 """
 
 import dataclasses
@@ -185,7 +186,7 @@ def c_engine(text, q, qd, qdd):
 
 
 def pushed(text, q, force, point, link):
-    """(T, n) torque at the joints of a force [N, world axes] on a point of a link: what the joints must bear, -Jᵀ f."""
+    """(T, n) what the joints must bear, -Jᵀ f, of a force [N, world axes] on a point of a link."""
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     out, J = np.zeros_like(q), np.zeros((3, model.nv))

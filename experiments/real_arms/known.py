@@ -1,4 +1,4 @@
-"""What the reference model of a real arm leaves that is there all the same, by its gain on held-out recordings."""
+"""What the reference model of a real arm leaves although it is there: by its gain on held-out recordings."""
 
 import chain as c
 import numpy as np
@@ -28,9 +28,19 @@ def families(chain, log):
     one = np.ones_like(q)
     return {
         "friction": (
-            FRICTION,
-            pick(v, sign, np.tanh(v / 0.05), v * np.abs(v), np.sqrt(np.abs(v)) * np.sign(v), np.abs(v),
-                 np.abs(rigid) * sign, _hysteresis(q, 2e-3), _hysteresis(q, 1e-2), _hysteresis(q, 4e-2)),
+            list(FRICTION),
+            pick(
+                v,
+                sign,
+                np.tanh(v / 0.05),
+                v * np.abs(v),
+                np.sqrt(np.abs(v)) * np.sign(v),
+                np.abs(v),
+                np.abs(rigid) * sign,
+                _hysteresis(q, 2e-3),
+                _hysteresis(q, 1e-2),
+                _hysteresis(q, 4e-2),
+            ),
         ),
         "offset": (["torque_offset"], pick(one)),
         "spring": (["joint_spring", "encoder_offset"], pick(one, q, np.sin(q), np.cos(q))),
@@ -38,7 +48,7 @@ def families(chain, log):
         "gain": (["torque_gain"], pick(rigid)),
         "elastic": (["joint_elasticity", "backlash"], pick(np.gradient(rigid, axis=0) * log.rate, a * v)),
         "drift": (["torque_drift"], pick(one, log.time[:, None] * one)),
-    }  # fmt: skip
+    }
 
 
 def whole(chain, log):
@@ -67,7 +77,7 @@ def _gain(A, b, A_test, b_test, ridge=1e-3):
 
 
 def known_structure(train, held, said, chain, noise):
-    """Claims that are neither right nor wrong: entries {effect, joints, why} of families that help where not fitted.
+    """Claims that are neither right nor wrong: {effect, joints, why} of families that help where not fitted.
 
     `said`: log -> torque by the true model. Also `unknown` at every joint where one of them helps.
     """
@@ -94,8 +104,7 @@ def known_structure(train, held, said, chain, noise):
     tables = [whole(chain, x) for x in [*train, held]]
     for name in tables[0]:
         parts = [band(t[name][1], x) for t, x in zip(tables, [*train, held], strict=True)]
-        k = parts[0].shape[2]
-        flat = lambda A: (A / noise[:, None]).reshape(-1, k)
+        flat = lambda A: (A / noise[:, None]).reshape(-1, A.shape[2])
         A, A_test = np.concatenate([flat(p) for p in parts[:-1]]), flat(parts[-1])
         test, seen = _gain(A, (b / noise).ravel(), A_test, (b_test / noise).ravel())
         if test > HELPS and seen > HELPS:

@@ -22,7 +22,7 @@ def uniform(name, time, q, qd, tau, rate):
 
 
 def craig(name, a, alpha, d, theta, mass, com, radius=0.06):
-    """A chain by modified Denavit-Hartenberg parameters; inertias are those of balls of that radius of gyration."""
+    """A chain by modified Denavit-Hartenberg parameters; its links have that radius of gyration."""
     turn, pos = [], []
     for ai, al, di, th in zip(a, alpha, d, theta, strict=True):
         c, s = np.cos(al), np.sin(al)

@@ -18,21 +18,28 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import added
 import chain as c
-import logs as real
 import numpy as np
+import scoring
 from added import FRICTION, number, other_friction
 from known import known_structure
 from reference import BAND, Log, Reference, factor_of, identify, inner, lowpass, motion, of_factor, shifted
 
 STRONG, WEAK = 14.0, 2.5  # RMS of an addition over the noise, at the joint where it shows most
 COUNTS = 0.7  # of the noise: what an effect must make at a joint to be listed there
+BORNE_OUT = (
+    1.05  # how much worse the user's model must be than the reference model, at a joint that is listed
+)
+LARGE_ENOUGH = (
+    0.15  # share of the error (in squares, over noise) that what is concealed must explain on train
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Split:
-    """What a case is made of: recordings that the reference model was identified on, that the tool gets, and a test."""
+    """What a case is made of: recordings of the reference model, recordings that the tool gets, and a test."""
 
     arm: str
     ref: Reference
@@ -100,9 +107,16 @@ class Secret:
 def control(s: Split, reference=False, note="") -> Secret:
     say = lambda log: c.torque(s.ref.chain, *motion(log))
     return Secret(
-        "control", "nothing", s.ref.chain, s.train, s.held[0], [], say,
-        reference=s.spare if reference else [], note=note,
-    )  # fmt: skip
+        "control",
+        "nothing",
+        s.ref.chain,
+        s.train,
+        s.held[0],
+        [],
+        say,
+        reference=s.spare if reference else [],
+        note=note,
+    )
 
 
 def semi(s: Split, what: added.Added, ratio, rng, reference=False, sign=None) -> Secret:
@@ -114,8 +128,19 @@ def semi(s: Split, what: added.Added, ratio, rng, reference=False, sign=None) ->
     per = np.max(what.rms(chain, s.train, small) / s.noise) / small
     size = min(ratio / per, what.most)
     if sign if sign is not None else rng.random() < 0.5:
-        size = -size if what.name in {"torque_gain", "encoder_offset", "torque_offset", "torque_drift",
-                                      "torque_crosstalk", "gravity_direction"} else size  # fmt: skip
+        size = (
+            -size
+            if what.name
+            in {
+                "torque_gain",
+                "encoder_offset",
+                "torque_offset",
+                "torque_drift",
+                "torque_crosstalk",
+                "gravity_direction",
+            }
+            else size
+        )
     size = float(f"{size:.3g}")
     rms = what.rms(chain, s.train, size)
     train = [what.into(log, size) for log in s.train]
@@ -132,23 +157,57 @@ def semi(s: Split, what: added.Added, ratio, rng, reference=False, sign=None) ->
     plain = lambda log: c.torque(chain, *motion(log))
     says = lambda k: plain if not what.lasts else lambda log: what.predicted(chain, log, k * size)
     return Secret(
-        "semi", f"{what.name} {joints}", chain, train, held, [effect], says(1.0), fitted=says if what.lasts else None,
+        "semi",
+        f"{what.name} {joints}",
+        chain,
+        train,
+        held,
+        [effect],
+        says(1.0),
+        fitted=says if what.lasts else None,
         reference=s.spare if reference else [],
         allowed=tuple(FRICTION) if what.name in FRICTION else (),
-    )  # fmt: skip
+    )
 
 
 def lost(
-    s: Split, title, user: c.Chain, effects, forms, options=(), reference=(), note="", held=None, train=None
+    s: Split, title, user, effects, forms, options=(), reference=(), note="", held=None, train=None, say=None
 ):
-    """The model lacks (or has too much of) what the real arm has."""
-    say = lambda log: c.torque(s.ref.chain, *motion(log))
+    """The model lacks (or has too much of) what the real arm has.
+
+    Joints count where the recordings bear it out: the true model (`say`, else the reference model) is better
+    there than the user's, both in what the tool gets and held out. Elsewhere the claim is neither right nor wrong.
+    """
+    train, held = train or s.train, held or s.held[0]
+    say = say or (lambda log: c.torque(s.ref.chain, *motion(log)))
+    worse = np.ones(s.ref.chain.dof, bool)
+    for logs in (train, [held]):
+        worse &= left(user, logs) > BORNE_OUT * left(None, logs, predicted=say)
+    doubtful = []
+    for e in effects:
+        if e["effect"] not in scoring.EVERYWHERE:
+            out = [j for j in e["joints"] if not worse[j - 1]]
+            e["joints"] = [j for j in e["joints"] if worse[j - 1]]
+            e["parameters"] = [x for x in e["parameters"] if x["joint"] in e["joints"]]
+            names = [e["effect"], *e["also"]] if out else []
+            doubtful += [{"effect": name, "joints": out, "why": "not borne out there"} for name in names]
     effects = [e for e in effects if e["joints"]]
     touched = any(e["effect"] in FRICTION for e in effects)
     return Secret(
-        "real", title, user, train or s.train, held or s.held[0], effects, say, forms=forms, options=options,
-        reference=list(reference), note=note, allowed=tuple(FRICTION) if touched else (),
-    )  # fmt: skip
+        "real",
+        title,
+        user,
+        train,
+        held,
+        effects,
+        say,
+        forms=forms,
+        options=options,
+        reference=list(reference),
+        note=note,
+        allowed=tuple(FRICTION) if touched else (),
+        more_allowed=tuple(doubtful),
+    )
 
 
 def difference(s: Split, name, values, unit, parameter, column, also=()):
@@ -194,7 +253,7 @@ def diagonal(*columns):
 
 
 def friction_forms(log):
-    q, v, a = motion(log)
+    q, v, _ = motion(log)
     return diagonal(v, np.tanh(v / c.STILL), *presliding(q))
 
 
@@ -253,7 +312,7 @@ def too_much_damping(s, joints, ratio):
 
 
 def nominal_links(s, nominal, options=()):
-    """The maker's links, or others' measurements of them, in place of the identified ones; friction as identified."""
+    """The maker's links in place of the identified ones; friction and rotors as identified."""
     user = s.ref.chain.but(phi=nominal.phi)
     other = s.ref.chain.phi - nominal.phi
     say = lambda log: c.regressor(s.ref.chain, *motion(log)) @ other.ravel()
@@ -301,17 +360,27 @@ def untared(s: Split):
     """The sensors' offsets are left in the log; MJCF cannot hold them."""
     offset = s.ref.offset
     effect = difference(
-        s, "torque_offset", offset, "N·m", "offset", lambda q, v, a: np.ones_like(q),
+        s,
+        "torque_offset",
+        offset,
+        "N·m",
+        "offset",
+        lambda q, v, a: np.ones_like(q),
         ("asymmetric_friction", "torque_drift"),
-    )  # fmt: skip
+    )
     back = lambda log: log.but(tau=log.tau + offset)
     say = lambda log: c.torque(s.ref.chain, *motion(log)) + offset
     forms = lambda log: diagonal(np.ones_like(log.q))
-    secret = lost(
-        s, "offsets of the sensors", s.ref.chain, [effect], forms, train=[back(x) for x in s.train],
+    return lost(
+        s,
+        "offsets of the sensors",
+        s.ref.chain,
+        [effect],
+        forms,
+        train=[back(x) for x in s.train],
         held=back(s.held[0]),
-    )  # fmt: skip
-    return dataclasses.replace(secret, truth_said=say)
+        say=say,
+    )
 
 
 def real_shift(log, lag):
@@ -334,13 +403,19 @@ def late(s: Split, lag, as_recorded):
         "also": [],
     }
     return Secret(
-        "real", f"torque late by {1e3 * lag:.0f} ms", s.ref.chain, [back(x) for x in train], back(held), [effect], say,
+        "real",
+        f"torque late by {1e3 * lag:.0f} ms",
+        s.ref.chain,
+        [back(x) for x in train],
+        back(held),
+        [effect],
+        say,
         fitted=lambda k: lambda log: shifted(c.torque(s.ref.chain, *motion(log)), -k * lag * log.rate),
-    )  # fmt: skip
+    )
 
 
 def before_the_gear(s: Split, sensors: Split):
-    """Motor currents, by a model of what the sensors behind the gears measure: gear friction and rotors are missing."""
+    """Motor currents, by a model of what the sensors behind the gears measure: it lacks their friction."""
     chain = s.ref.chain
     user = sensors.ref.chain
     true = chain
@@ -351,7 +426,7 @@ def before_the_gear(s: Split, sensors: Split):
     say = lambda log: c.torque(true, *motion(log))
     secret = lost(s, "friction and rotors before the gears", user, effects, forms)
     offset = [{"effect": "torque_offset", "joints": None}, {"effect": "inertial_parameters", "joints": None}]
-    return dataclasses.replace(secret, truth_said=say, more_allowed=tuple(offset))
+    return dataclasses.replace(secret, truth_said=say, more_allowed=(*secret.more_allowed, *offset))
 
 
 def load_taken_out(s: Split, body):
@@ -377,7 +452,7 @@ def load_taken_out(s: Split, body):
 
 
 def oracle(secret: Secret, noise):
-    """(said on the held-out log, RMS up to BAND): the best of the true model and its true form fitted on train."""
+    """(said on the held-out log, RMS up to BAND): the best of the true model and of its form fitted on train."""
     weight = 1 / noise
     sayers = [secret.truth_said]
     if secret.forms is not None:
@@ -388,10 +463,14 @@ def oracle(secret: Secret, noise):
         scale = np.sqrt(np.mean(A**2, 0)) + 1e-9
         k = len(scale)
         for ridge in (1e-3, 1e-1):
-            x = np.linalg.lstsq(
-                np.concatenate([A / scale, np.sqrt(ridge * len(A) / k) * 0.03 * np.eye(k)]),
-                np.concatenate([b, np.zeros(k)]), rcond=None,
-            )[0] / scale  # fmt: skip
+            x = (
+                np.linalg.lstsq(
+                    np.concatenate([A / scale, np.sqrt(ridge * len(A) / k) * 0.03 * np.eye(k)]),
+                    np.concatenate([b, np.zeros(k)]),
+                    rcond=None,
+                )[0]
+                / scale
+            )
             sayers.append(lambda log, x=x: c.torque(secret.user, *motion(log)) + secret.forms(log) @ x)
     if secret.fitted is not None:
         factors = np.linspace(0.6, 1.4, 17)
@@ -422,7 +501,31 @@ def rounded(values):
     return [float(f"{v:.5g}") for v in values]
 
 
+def explained(secret: Secret, noise):
+    """Share of the user's model's error (squares over noise) that the truth explains, on train and held out."""
+    shares = []
+    for logs in (secret.train, [secret.held]):
+        user, true = (
+            np.sum((x / noise) ** 2)
+            for x in (left(secret.user, logs), left(None, logs, predicted=secret.truth_said))
+        )
+        shares.append(float(1 - true / user))
+    return shares
+
+
 def write(folder: Path, s: Split, secret: Secret):
+    """Writes the case, or not where the recordings do not show what is concealed; whether it did."""
+    shares = explained(secret, s.noise)
+    lasts = np.any(
+        np.abs(c.torque(secret.user, *motion(secret.held)) - secret.truth_said(secret.held)) > 1e-6
+    )
+    if secret.kind != "control" and (
+        shares[0] < LARGE_ENOUGH or (lasts and shares[1] < 0) or not secret.effects
+    ):
+        print(
+            f"left out: {s.arm}, {secret.title}: explains {shares[0]:.2f} on train, {shares[1]:.2f} held out"
+        )
+        return False
     folder.mkdir(parents=True)
     (folder / "model.xml").write_text(c.mjcf(secret.user))
     for i, log in enumerate(secret.train):
@@ -441,7 +544,6 @@ def write(folder: Path, s: Split, secret: Secret):
     user_left = left(secret.user, secret.train)
     true_left = np.sqrt(np.mean(np.concatenate(true) ** 2, 0))
     allowed = [{"effect": name, "joints": None} for name in secret.allowed] + list(secret.more_allowed)
-    before = len(allowed)
     allowed += known_structure(secret.train, held, secret.truth_said, s.ref.chain, s.noise)
     truth = {
         "effects": [{**e, "rms_torque": rounded(e["rms_torque"])} for e in secret.effects],
@@ -471,14 +573,13 @@ def write(folder: Path, s: Split, secret: Secret):
             },
         },
         "train": {"user_model": rounded(user_left), "reference_model": rounded(true_left)},
+        "explained": {"train": round(shares[0], 3), "heldout": round(shares[1], 3)},
         "reference_model": {
-            "relative_error_percent": float(
-                f"{100 * np.linalg.norm(s.noise) / np.linalg.norm(size):.3g}"
-            ),
+            "relative_error_percent": float(f"{100 * np.linalg.norm(s.noise) / np.linalg.norm(size):.3g}"),
             "fitted_rmse": rounded(s.ref.std),
             "offset_tared": rounded(s.ref.offset),
         },
-    }  # fmt: skip
+    }
     (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
     row = lambda v: " ".join(f"{x:.3g}" for x in v)
     print(f"{folder.name}: {secret.kind}, {secret.title}")
@@ -488,10 +589,15 @@ def write(folder: Path, s: Split, secret: Secret):
     print(f"  noise {row(s.noise)} ({truth['reference_model']['relative_error_percent']} % of the torque)")
     h = truth["heldout"]["rmse_up_to_10_hz"]
     print(
-        f"  held out to 10 Hz: user {row(h['user_model'])}; oracle {row(h['oracle'])}; ref. {row(h['reference_model'])}"
+        f"  held out to 10 Hz: user {row(h['user_model'])}; oracle {row(h['oracle'])};"
+        f" reference {row(h['reference_model'])}"
     )
-    for e in allowed[before:]:
-        print(f"  allowed: {e['effect']} {e['joints']} ({e['why']})")
+    if secret.kind != "control":
+        print(f"  explains of the model's error: {shares[0]:.2f} on train, {shares[1]:.2f} held out")
+    for why in dict.fromkeys(e["why"] for e in allowed if "why" in e):
+        some = [e for e in allowed if e.get("why") == why]
+        print(f"  allowed: {', '.join(e['effect'] for e in some)} {some[0]['joints'] or ''} ({why})")
+    return True
 
 
 def main():
@@ -510,8 +616,9 @@ def main():
         if options.only and arm not in options.only:
             continue
         rng = np.random.default_rng([options.seed, k])
-        for number_, (s, secret) in enumerate(cases(options.data, rng)):
-            write(options.out / f"{arm}_{number_:02d}", s, secret)
+        count = 0
+        for s, secret in cases(options.data, rng):
+            count += write(options.out / f"{arm}_{count:02d}", s, secret)
 
 
 if __name__ == "__main__":

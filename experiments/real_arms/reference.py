@@ -241,3 +241,27 @@ def shifted(x, samples):
         return x
     t = np.arange(len(x))
     return np.stack([np.interp(t + samples, t, c) for c in x.T], 1)
+
+
+def lag(nominal, logs, lags, spread=0.3):
+    """The delay of torque [s] among `lags` with which links near `nominal` and friction leave least."""
+    n = nominal.dof
+    size = (spread * np.abs(nominal.phi).max(1, keepdims=True) * np.ones(10)).ravel()
+    rows = []
+    for log in logs:
+        q, qd, qdd = motion(log)
+        own = np.concatenate([np.einsum("tj,ji->tji", x, np.eye(n)) for x in (qd, np.tanh(qd / STILL))], 2)
+        rows.append(lowpass(np.concatenate([regressor(nominal, q, qd, qdd) * size, own], 2), log.rate))
+    keep = [inner(log) for log in logs]
+    A = np.concatenate([r[k] for r, k in zip(rows, keep, strict=True)])
+    cost = []
+    for late in lags:
+        tau = [lowpass(shifted(x.tau, late * x.rate), x.rate) for x in logs]
+        b = np.concatenate([x[k] for x, k in zip(tau, keep, strict=True)])
+        weight = 1 / b.std(0)
+        for _ in range(3):
+            W, r = (A * weight[:, None]).reshape(-1, A.shape[2]), (b * weight).ravel()
+            x = np.linalg.solve(W.T @ W + 0.01 * len(b) * np.eye(A.shape[2]), W.T @ r)
+            weight = 1 / np.maximum((b - A @ x).std(0), 1e-3)
+        cost.append(-np.sum(np.log(weight)))
+    return float(lags[int(np.argmin(cost))])

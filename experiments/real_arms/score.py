@@ -2,8 +2,8 @@
 
     python score.py --cases CASES --out ANSWERS [--jobs N] [--limit SECONDS] [--only PREFIX ...]
 
-Every case is a process of its own (`python -m jaxpanda`); cases that have an answer in ANSWERS are kept. Needs the
-cases and the tool, and none of the recordings. Figures by family and joint are those of ../scoring.py.
+Every case is a process of its own (`python -m jaxpanda`); cases that have an answer in ANSWERS are kept. Needs
+the cases and the tool, and none of the recordings. Figures by family and joint are those of ../scoring.py.
 """
 
 import argparse
