@@ -176,7 +176,7 @@ def lost(
     """The model lacks (or has too much of) what the real arm has.
 
     Joints count where the recordings bear it out: the true model (`say`, else the reference model) is better
-    there than the user's, both in what the tool gets and held out. Elsewhere the claim is neither right nor wrong.
+    there than the user's, in what the tool gets and held out. Elsewhere the claim is neither right nor wrong.
     """
     train, held = train or s.train, held or s.held[0]
     say = say or (lambda log: c.torque(s.ref.chain, *motion(log)))
