@@ -33,9 +33,9 @@ def _contact(rng, chain, train, link):
 
 
 def _middle(log, rng):
-    """(start, stop): from somewhere in the middle on to the end, and beyond."""
+    """(start, stop): from somewhere in the middle on to the end."""
     t = log.time
-    return round(float(t[0] + rng.uniform(0.35, 0.65) * (t[-1] - t[0])), 2), 1e6
+    return round(float(t[0] + rng.uniform(0.35, 0.65) * (t[-1] - t[0])), 2), round(float(t[-1]) + 0.01, 2)
 
 
 # -------------------------------------------------------------------------------------------------- Panda
@@ -135,7 +135,6 @@ def ur10e(data, rng):
     yield other, m.friction_lost(other, joints)
     yield s, m.rotors_lost(s)
     yield slow, m.friction_lost(slow)
-    yield other, m.nominal_links(other, real.ur10e_nominal(data))
     com = np.round([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.12, 0.22)], 3)
     rise, speed = round(float(rng.uniform(1.8, 3)), 2), round(float(rng.uniform(0.05, 0.15)), 3)
     menu = [
@@ -336,6 +335,7 @@ def doosan(data, rng):
     yield s, m.untared(s)
     yield other, m.friction_lost(other)
     yield s, m.placeholders(s)
+    yield other, m.nominal_links(other, real.doosan_nominal(data))
     menu = [
         lambda s: added.coulomb(6, pick(1, 2, 3, 4)),
         lambda s: added.drift(6, pick(1, 2, 3, 4, 5), round(float(rng.uniform(4, 12)), 1)),

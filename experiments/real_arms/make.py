@@ -29,12 +29,18 @@ from reference import BAND, Log, Reference, factor_of, identify, inner, lowpass,
 
 STRONG, WEAK = 14.0, 2.5  # RMS of an addition over the noise, at the joint where it shows most
 COUNTS = 0.7  # of the noise: what an effect must make at a joint to be listed there
-BORNE_OUT = (
-    1.05  # how much worse the user's model must be than the reference model, at a joint that is listed
-)
-LARGE_ENOUGH = (
-    0.15  # share of the error (in squares, over noise) that what is concealed must explain on train
-)
+BORNE_OUT = 1.05  # how much worse than the reference model the user's must be at a joint that is listed
+LARGE_ENOUGH = 0.15  # share of the error (squares over noise) that what is concealed must explain on train
+PROBE = {"torque_gain": 0.05, "encoder_offset": 0.01, "time_delay": 0.004, "gravity_direction": 0.01}
+"""Sizes at which effects that are not linear are measured first."""
+EITHER_WAY = {
+    "torque_gain",
+    "encoder_offset",
+    "torque_offset",
+    "torque_drift",
+    "torque_crosstalk",
+    "gravity_direction",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,8 +51,8 @@ class Split:
     ref: Reference
     identified_on: list
     train: list
-    held: list
-    """One log; it shares no sample with the others."""
+    held: Log
+    """It shares no sample with the others."""
     noise: np.ndarray
     spare: list = ()
     """Further recordings of the arm, for --reference."""
@@ -63,7 +69,7 @@ def split(arm, nominal, identified_on, train, held, spare=(), tare=True, **how) 
         train, spare = [tared(x, ref) for x in train], [tared(x, ref) for x in spare]
         held = tared(held, ref)
     noise = left(ref.chain, [held])
-    return Split(arm, ref, list(identified_on), list(train), [held], noise, list(spare))
+    return Split(arm, ref, list(identified_on), list(train), held, noise, list(spare))
 
 
 def errors(log, said, band=BAND):
@@ -111,7 +117,7 @@ def control(s: Split, reference=False, note="") -> Secret:
         "nothing",
         s.ref.chain,
         s.train,
-        s.held[0],
+        s.held,
         [],
         say,
         reference=s.spare if reference else [],
@@ -119,32 +125,17 @@ def control(s: Split, reference=False, note="") -> Secret:
     )
 
 
-def semi(s: Split, what: added.Added, ratio, rng, reference=False, sign=None) -> Secret:
-    """A known effect in the real log, as large as `ratio` times the noise allows."""
+def semi(s: Split, what: added.Added, ratio, rng, reference=False) -> Secret:
+    """A known effect in the real log, as large as `ratio` times the noise or as large as makes sense."""
     chain = s.ref.chain
-    small = {"gain": 0.05, "encoder": 0.01, "delay": 0.004}.get(
-        what.kind, 0.01 if what.name == "gravity_direction" else 1.0
-    )
-    per = np.max(what.rms(chain, s.train, small) / s.noise) / small
-    size = min(ratio / per, what.most)
-    if sign if sign is not None else rng.random() < 0.5:
-        size = (
-            -size
-            if what.name
-            in {
-                "torque_gain",
-                "encoder_offset",
-                "torque_offset",
-                "torque_drift",
-                "torque_crosstalk",
-                "gravity_direction",
-            }
-            else size
-        )
+    probe = PROBE.get(what.name, 1.0)
+    size = min(probe * ratio / np.max(what.rms(chain, s.train, probe) / s.noise), what.most)
+    if rng.random() < 0.5 and what.name in EITHER_WAY:
+        size = -size
     size = float(f"{size:.3g}")
     rms = what.rms(chain, s.train, size)
     train = [what.into(log, size) for log in s.train]
-    held = what.into(s.held[0], size) if what.lasts else s.held[0]
+    held = what.into(s.held, size) if what.lasts else s.held
     joints = what.joints or [int(np.argmax(rms / s.noise)) + 1]
     effect = {
         "effect": what.name,
@@ -154,8 +145,13 @@ def semi(s: Split, what: added.Added, ratio, rng, reference=False, sign=None) ->
         "rms_torque": rms,
         "also": list(what.also),
     }
-    plain = lambda log: c.torque(chain, *motion(log))
-    says = lambda k: plain if not what.lasts else lambda log: what.predicted(chain, log, k * size)
+
+    def says(k):
+        """The true model; what does not last is not in the held-out recording, whatever its stamps."""
+        absent = lambda log: log is held and not what.lasts
+        with_it = lambda log: what.predicted(chain, log, k * size)
+        return lambda log: c.torque(chain, *motion(log)) if absent(log) else with_it(log)
+
     return Secret(
         "semi",
         f"{what.name} {joints}",
@@ -178,7 +174,7 @@ def lost(
     Joints count where the recordings bear it out: the true model (`say`, else the reference model) is better
     there than the user's, in what the tool gets and held out. Elsewhere the claim is neither right nor wrong.
     """
-    train, held = train or s.train, held or s.held[0]
+    train, held = train or s.train, held or s.held
     say = say or (lambda log: c.torque(s.ref.chain, *motion(log)))
     worse = np.ones(s.ref.chain.dof, bool)
     for logs in (train, [held]):
@@ -312,7 +308,7 @@ def too_much_damping(s, joints, ratio):
 
 
 def nominal_links(s, nominal, options=()):
-    """The maker's links in place of the identified ones; friction and rotors as identified."""
+    """Links as somebody guessed or drew them; friction and rotors as identified."""
     user = s.ref.chain.but(phi=nominal.phi)
     other = s.ref.chain.phi - nominal.phi
     say = lambda log: c.regressor(s.ref.chain, *motion(log)) @ other.ravel()
@@ -378,7 +374,7 @@ def untared(s: Split):
         [effect],
         forms,
         train=[back(x) for x in s.train],
-        held=back(s.held[0]),
+        held=back(s.held),
         say=say,
     )
 

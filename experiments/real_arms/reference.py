@@ -224,7 +224,7 @@ def _solve(start, nominal, W, r, rotors, tilt, offsets, friction, spread, moved,
     z0 = np.concatenate([eta, np.clip(free[10 * n :], lower + 1e-10, upper - 1e-10)])
     low = np.concatenate([np.full(10 * n, -25.0), lower])
     high = np.concatenate([np.full(10 * n, 25.0), upper])
-    found = least_squares(residual, z0, jacobian, bounds=(low, high), x_scale="jac", max_nfev=80)
+    found = least_squares(residual, z0, jacobian, bounds=(low, high), x_scale="jac", max_nfev=50)
     x = unpack(found.x)
     values = x[10 * n : 14 * n].reshape(4, n).copy()
     values[np.abs(values) < 1e-6] = 0.0
