@@ -148,17 +148,19 @@ def asymmetric(n, j, ratio):
     return Added("asymmetric_friction", [j], form, told, also=("coulomb_friction",))
 
 
+def bristle(q, distance):
+    """(T, n) Dahl's z, from -1 to 1: z' = v (1 - sgn(v) z) / distance [rad], exact where speed keeps its sign."""
+    z = np.zeros_like(q)
+    way = np.diff(q, axis=0)
+    side, decay = np.sign(way), np.exp(-np.abs(way) / distance)
+    for t in range(1, len(q)):
+        z[t] = side[t - 1] + (z[t - 1] - side[t - 1]) * decay[t - 1]
+    return z
+
+
 def hysteresis(n, j, distance):
-    """Dahl's bristle, z' = v (1 - sgn(v) z) / distance [rad]; exact where speed keeps its sign for a sample."""
-
-    def form(log, s):
-        q = motion(log, FAST)[0][:, j - 1]
-        z = np.zeros(len(q))
-        for t in range(1, len(q)):
-            d = q[t] - q[t - 1]
-            z[t] = np.sign(d) + (z[t - 1] - np.sign(d)) * np.exp(-abs(d) / distance) if d else z[t - 1]
-        return s * one(n, j, z)
-
+    """Friction s that builds up over a distance [rad]."""
+    form = lambda log, s: s * one(n, j, bristle(motion(log, FAST)[0], distance)[:, j - 1])
     told = lambda s: [number("friction", j, s, "N·m"), number("distance", j, distance, "rad")]
     return Added("presliding_hysteresis", [j], form, told, also=("coulomb_friction",))
 

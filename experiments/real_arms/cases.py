@@ -6,8 +6,8 @@ import itertools
 
 import added
 import chain as c
+import conceal as m
 import logs as real
-import make as m
 import numpy as np
 from chain import from_com
 from reference import identify, lag
@@ -52,7 +52,10 @@ def panda(data, rng):
     """21 s that repeat themselves after 13.33 s: 6 to 9 s each for the model, the tool and the test."""
     log = real.panda(data)
     shift = rng.uniform(-0.4, 0.4)
-    cuts = {"early": (0.1, 8.5 + shift, 14.8 + shift, 20.9), "late": (20.9, 13.2 + shift, 6.6 + shift, 0.1)}
+    cuts = {
+        "early": (0.1, 8.5 + shift, 14.8 + shift, 20.9),
+        "late": (20.9, 13.2 + shift, 6.6 + shift, 0.1),
+    }
 
     @functools.cache
     def split(which):
@@ -77,7 +80,10 @@ def panda(data, rng):
     yield other, m.control(other, reference=True)
     yield s, m.friction_lost(s)
     yield other, m.placeholders(other)
-    yield s, m.too_much_damping(s, sorted(int(j) for j in rng.choice(7, 2, False) + 1), _ratio(rng))
+    yield (
+        s,
+        m.too_much_damping(s, sorted(int(j) for j in rng.choice(7, 2, False) + 1), _ratio(rng)),
+    )
     com = np.round([*rng.uniform(-0.03, 0.03, 2), rng.uniform(0.1, 0.2)], 3)
     one, two = pick(1, 2, 3), pick(4, 5, 6)
     menu = [
@@ -91,7 +97,10 @@ def panda(data, rng):
         lambda s: added.crosstalk(s.ref.chain, one, two),
         lambda s: added.offset(7, pick(1, 2, 3, 4, 5, 6, 7)),
         lambda s: added.ripple(
-            7, pick(1, 2, 3, 4), int(rng.integers(4, 20)), round(float(rng.uniform(0, 6)), 2)
+            7,
+            pick(1, 2, 3, 4),
+            int(rng.integers(4, 20)),
+            round(float(rng.uniform(0, 6)), 2),
         ),
         lambda s: added.tilt(s.ref.chain, round(float(rng.uniform(0, 6.28)), 2)),
     ]
@@ -105,7 +114,7 @@ def ur10e(data, rng):
     """Files of several days: the model from two, the tool gets another, the test is a fourth."""
 
     @functools.cache
-    def split(ident, train, held, seconds=23.0):
+    def split(ident, train, held, seconds=20.0):
         read = lambda k: real.ur10e(data, k)
         start = float(np.round(rng.uniform(1.0, 3.0), 1))
         cut = lambda k: read(k).part(start, start + seconds)
@@ -115,7 +124,7 @@ def ur10e(data, rng):
             [read(k) for k in ident],
             [cut(train)],
             cut(held),
-            [read(ident[0]).part(0, 20)],
+            [read(ident[0]).part(0, 15)],
             tare=False,
             rotors=True,
             offsets=False,
@@ -130,13 +139,19 @@ def ur10e(data, rng):
     loaded = real.ur10e(data, "load")
     base = split("AB" if rng.random() < 0.5 else "BC", "D", "D")
     for reference in (True, False):
-        yield base, _mounted(base, loaded, real.ur10e(data, "D").part(1, 25) if reference else None)
+        yield (
+            base,
+            _mounted(base, loaded, real.ur10e(data, "D").part(1, 25) if reference else None),
+        )
     joints = sorted(int(j) for j in rng.choice(6, 2, False) + 1)
     yield other, m.friction_lost(other, joints)
     yield s, m.rotors_lost(s)
     yield slow, m.friction_lost(slow)
     com = np.round([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.12, 0.22)], 3)
-    rise, speed = round(float(rng.uniform(1.8, 3)), 2), round(float(rng.uniform(0.05, 0.15)), 3)
+    rise, speed = (
+        round(float(rng.uniform(1.8, 3)), 2),
+        round(float(rng.uniform(0.05, 0.15)), 3),
+    )
     menu = [
         lambda s: _only_there(added.payload(s.ref.chain, com, 0.06, _middle(s.train[0], rng))),
         lambda s: added.spring(6, pick(1, 2, 3, 4), round(float(rng.uniform(-0.5, 0.5)), 2)),
@@ -220,12 +235,25 @@ def iiwa(data, rng):
         """(split of logs without lag, lag [s], (train, held) as recorded)."""
         ident, train, held = parts
         late = lag(nominal, ident, np.arange(0, 0.081, 0.005), how["spread"])
-        back = lambda log: log.but(tau=m.real_shift(log, late))
-        s = m.split("iiwa", nominal, [back(x) for x in ident], [back(x) for x in train], back(held), **how)
+        back = lambda log: m.put_right(log, late)
+        s = m.split(
+            "iiwa",
+            nominal,
+            [back(x) for x in ident],
+            [back(x) for x in train],
+            back(held),
+            **how,
+        )
         return s, late, (train, held)
 
-    six = chirp("J6_chirp", [(0.5, 12 + cut), (34 + cut, 45), (12 + cut, 23 + cut), (23 + cut, 34 + cut)])
-    three = chirp("J3_chirp", [(0.5, 12 + cut), (34 + cut, 46), (12 + cut, 23 + cut), (23 + cut, 34 + cut)])
+    six = chirp(
+        "J6_chirp",
+        [(0.5, 12 + cut), (34 + cut, 45), (12 + cut, 23 + cut), (23 + cut, 34 + cut)],
+    )
+    three = chirp(
+        "J3_chirp",
+        [(0.5, 12 + cut), (34 + cut, 46), (12 + cut, 23 + cut), (23 + cut, 34 + cut)],
+    )
     first, second = real.iiwa(data, "J5_chirp")
     five = (
         [first.part(0.5, 10 + cut), second.part(0.5, 8)],
@@ -360,7 +388,12 @@ def ur5(data, rng):
     """63 s of picking with 1.6 lb, at half speed. The identification starts from links that hold the load."""
     log = real.ur5(data)
     shift = rng.uniform(-2.0, 2.0)
-    parts = [(0.5, 16 + shift), (16 + shift, 32 + shift), (32 + shift, 48 + shift), (48 + shift, 63)]
+    parts = [
+        (0.5, 16 + shift),
+        (16 + shift, 32 + shift),
+        (32 + shift, 48 + shift),
+        (48 + shift, 63),
+    ]
     bare = real.ur5_nominal(data)
     body = from_com(LOAD, [0, 0, 0.0823 + 0.05], 0.4 * LOAD * 0.04**2 * np.eye(3))
     phi = bare.phi.copy()
@@ -395,4 +428,11 @@ def ur5(data, rng):
     yield from _several(rng, other, s, menu, 2, reference=0)
 
 
-ARMS = {"panda": panda, "ur10e": ur10e, "iiwa": iiwa, "kinova": kinova, "doosan": doosan, "ur5": ur5}
+ARMS = {
+    "panda": panda,
+    "ur10e": ur10e,
+    "iiwa": iiwa,
+    "kinova": kinova,
+    "doosan": doosan,
+    "ur5": ur5,
+}

@@ -2,21 +2,11 @@
 
 import chain as c
 import numpy as np
-from added import FRICTION
+from added import FRICTION, bristle
 from reference import BAND, inner, lowpass, motion
 
 HELPS = 0.05
 """Share of the residual's square that a family must explain on the held-out recording, fitted on the others."""
-
-
-def _hysteresis(q, distance):
-    z = np.zeros_like(q)
-    d = np.diff(q, axis=0)
-    decay = np.exp(-np.abs(d) / distance)
-    for t in range(1, len(q)):
-        side = np.sign(d[t - 1])
-        z[t] = side + (z[t - 1] - side) * decay[t - 1]
-    return z
 
 
 def families(chain, log):
@@ -37,9 +27,9 @@ def families(chain, log):
                 np.sqrt(np.abs(v)) * np.sign(v),
                 np.abs(v),
                 np.abs(rigid) * sign,
-                _hysteresis(q, 2e-3),
-                _hysteresis(q, 1e-2),
-                _hysteresis(q, 4e-2),
+                bristle(q, 2e-3),
+                bristle(q, 1e-2),
+                bristle(q, 4e-2),
             ),
         ),
         "offset": (["torque_offset"], pick(one)),

@@ -108,7 +108,7 @@ def ur10e_nominal(_):
 
 
 @functools.cache
-def iiwa(data: Path, name: str, rate=200.0):
+def iiwa(data: Path, name: str, rate=125.0):
     """The runs of a file."""
     return [uniform(f"iiwa-{r.name}", r.time, r.q, r.qd, r.tau, rate) for r in real.iiwa(data, name)]
 
