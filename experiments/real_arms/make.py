@@ -17,6 +17,7 @@ import json
 from pathlib import Path
 
 import chain as c
+import mujoco
 import numpy as np
 from cases import ARMS
 from conceal import Secret, Split, errors, left
@@ -107,6 +108,7 @@ def write(folder: Path, s: Split, secret: Secret):
         return False
     folder.mkdir(parents=True)
     (folder / "model.xml").write_text(c.mjcf(secret.user))
+    mujoco.MjModel.from_xml_path(str(folder / "model.xml"))  # refuses links that nobody could build
     for i, log in enumerate(secret.train):
         write_csv(folder / f"train_{i}.csv", log)
     for i, log in enumerate(secret.reference):

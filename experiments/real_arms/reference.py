@@ -77,6 +77,9 @@ def of_pseudo(J):
 
 
 _LOWER = np.tril_indices(4)
+_DIAGONAL = np.flatnonzero(_LOWER[0] == _LOWER[1])
+THIN = 1e-3
+"""Least diagonal of the factor [kg^½ m]: keeps inertias off the edge of the triangle inequality by 2e-6 kg m²."""
 
 
 def of_factor(eta):
@@ -218,11 +221,14 @@ def _solve(start, nominal, W, r, rotors, tilt, offsets, friction, spread, moved,
     S, s = np.concatenate([R, np.diag(deviation)]), np.concatenate([y, deviation * centre])
     free = np.zeros(len(centre))
     free[~bar] = np.linalg.lstsq(S[:, ~bar], s)[0]
+    body = np.full(10, -25.0)
+    body[_DIAGONAL] = np.log(THIN)
     eta = np.concatenate(
         [factor_of(p, 1e-4 * m[0]) for p, m in zip(free[: 10 * n].reshape(n, 10), phi0, strict=True)]
     )
+    eta = np.maximum(eta, np.tile(body, n) + 1e-6)
     z0 = np.concatenate([eta, np.clip(free[10 * n :], lower + 1e-10, upper - 1e-10)])
-    low = np.concatenate([np.full(10 * n, -25.0), lower])
+    low = np.concatenate([np.tile(body, n), lower])
     high = np.concatenate([np.full(10 * n, 25.0), upper])
     found = least_squares(residual, z0, jacobian, bounds=(low, high), x_scale="jac", max_nfev=50)
     x = unpack(found.x)
