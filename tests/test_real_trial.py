@@ -3,6 +3,7 @@
 import ast
 import importlib
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -251,3 +252,31 @@ def test_the_time_limit_ends_what_takes_too_long(trial):
     status, printed = trial["score"].call(["--help"], 0.01)
     assert status == 124
     assert "longer than" in printed
+
+
+@pytest.mark.slow
+def test_the_cases_of_one_arm_are_whole(data, tmp_path):
+    """Kinova's: every model loads in MuJoCo, and the truth predicts held-out torque better than the user's model."""
+    if not (data / "kinova_gen3").is_dir():
+        pytest.skip("no Kinova here")
+    command = [sys.executable, str(FOLDER / "make.py"), "--data", str(data), "--out", str(tmp_path)]
+    subprocess.run([*command, "--seed", "5", "--only", "kinova"], check=True, capture_output=True)
+    cases = sorted(tmp_path.iterdir())
+    assert len(cases) == 3
+    for case in cases:
+        truth = json.loads((case / "truth.json").read_text())
+        n = mujoco.MjModel.from_xml_path(str(case / "model.xml")).nv
+        train, held, motion = (
+            np.loadtxt(case / f"{name}.csv", delimiter=",", skiprows=1)
+            for name in ("train_0", "heldout", "heldout_motion")
+        )
+        assert train.shape[1] == held.shape[1] == 1 + 3 * n
+        np.testing.assert_array_equal(motion, held[:, : 1 + 2 * n])
+        assert not np.isin(held[:, 1], train[:, 1]).all()
+        error = truth["heldout"]
+        if truth["effects"]:
+            before, after = (np.linalg.norm(error[k]) for k in ("rmse_nominal", "rmse_true_model"))
+            assert after < 0.98 * before
+            assert truth["explained"]["train"] > 0.15
+        else:
+            assert error["rmse_nominal"] == error["rmse_true_model"]
