@@ -256,7 +256,7 @@ def test_the_time_limit_ends_what_takes_too_long(trial):
 
 @pytest.mark.slow
 def test_the_cases_of_one_arm_are_whole(data, tmp_path):
-    """Kinova's: every model loads in MuJoCo, and the truth predicts held-out torque better than the user's model."""
+    """Kinova's: every model loads in MuJoCo, and the truth predicts held-out torque better than the user's."""
     if not (data / "kinova_gen3").is_dir():
         pytest.skip("no Kinova here")
     command = [sys.executable, str(FOLDER / "make.py"), "--data", str(data), "--out", str(tmp_path)]
