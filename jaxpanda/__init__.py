@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from .diagnosis import Diagnosis as Diagnosis
     from .diagnosis import diagnose as diagnose
     from .diagnosis import predict as predict
+    from .ensemble import Ensemble as Ensemble
+    from .ensemble import draw_ensemble as draw_ensemble
     from .errors import InputError as InputError
     from .excitation import excite as excite
     from .feasible import Bounds as Bounds
@@ -46,6 +48,7 @@ _HOME = {
     "Bounds": "feasible",
     "Corrected": "corrected",
     "Diagnosis": "diagnosis",
+    "Ensemble": "ensemble",
     "Identification": "identification",
     "InputError": "errors",
     "Reading": "reading",
@@ -53,6 +56,7 @@ _HOME = {
     "Retrieval": "retrieval",
     "demonstrate": "demo",
     "diagnose": "diagnosis",
+    "draw_ensemble": "ensemble",
     "estimate_payload": "payload",
     "excite": "excitation",
     "predict": "diagnosis",

@@ -411,6 +411,40 @@ class Excite:
         )
 
 
+@dataclasses.dataclass(frozen=True)
+class Ensemble:
+    """Arms that recordings cannot tell apart, each of which could be built: links, friction, effects."""
+
+    out: Path
+    """Folder for ensemble.json, ensemble.npz and member_1.xml, ..."""
+    retrieval: Path | None = None
+    """Folder that `retrieve` wrote."""
+    diagnosis: Path | None = None
+    """Folder that `diagnose` wrote, instead."""
+    count: int = 1000
+    """Members."""
+    seed: int = 0
+    mjcf: int = 0
+    """How many members, the first ones, to write as MJCF too."""
+    sweeps: int = 400
+    """Of each chain; more where the result says that chains have not mixed."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import ensemble
+
+        return ensemble.ensemble_files(
+            self.out,
+            self.retrieval,
+            self.diagnosis,
+            count=self.count,
+            seed=self.seed,
+            mjcf=self.mjcf,
+            sweeps=self.sweeps,
+        )
+
+
 _COMMANDS = (
     Demo,
     Inspect,
@@ -423,6 +457,7 @@ _COMMANDS = (
     Payload,
     Convert,
     Excite,
+    Ensemble,
 )
 
 
