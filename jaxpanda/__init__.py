@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     __version__: str
     from .arm import Arm as Arm
+    from .comparison import Comparison as Comparison
+    from .comparison import compare as compare
     from .corrected import Corrected as Corrected
     from .demo import demonstrate as demonstrate
     from .diagnosis import Diagnosis as Diagnosis
@@ -46,6 +48,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Arm": "arm",
     "Bounds": "feasible",
+    "Comparison": "comparison",
     "Corrected": "corrected",
     "Diagnosis": "diagnosis",
     "Ensemble": "ensemble",
@@ -54,6 +57,7 @@ _HOME = {
     "Reading": "reading",
     "Recording": "recordings",
     "Retrieval": "retrieval",
+    "compare": "comparison",
     "demonstrate": "demo",
     "diagnose": "diagnosis",
     "draw_ensemble": "ensemble",

@@ -445,6 +445,27 @@ class Ensemble:
         )
 
 
+@dataclasses.dataclass(frozen=True)
+class Compare:
+    """Whether two results of identify, retrieve or diagnose agree, and what explains where they do not."""
+
+    a: tyro.conf.Positional[Path]
+    """Folder of one result."""
+    b: tyro.conf.Positional[Path]
+    """Folder of another, of the same arm."""
+    out: Path
+    """Folder for comparison.json and comparison.html."""
+    motion: Path | None = None
+    """On which the torque of both is compared; without it one within the joints' ranges."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import comparison
+
+        return comparison.compare_files(self.out, self.a, self.b, self.motion)
+
+
 _COMMANDS = (
     Demo,
     Inspect,
@@ -458,6 +479,7 @@ _COMMANDS = (
     Convert,
     Excite,
     Ensemble,
+    Compare,
 )
 
 

@@ -100,7 +100,9 @@ class Posterior:
         except InputError:
             raise
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise InputError(f"{path}: is not as it was written ({error}); retrieve or diagnose again") from None
+            raise InputError(
+                f"{path}: is not as it was written ({error}); retrieve or diagnose again"
+            ) from None
         return found
 
     def _check(self) -> None:

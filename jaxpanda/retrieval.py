@@ -365,7 +365,9 @@ def _posterior(
     if table.std is None or not np.all(table.std > 0):
         return None
     told = np.isfinite(table.std)
-    covariance = np.diag(np.where(told, table.std, 1.0) ** 2) if table.covariance is None else table.covariance
+    covariance = (
+        np.diag(np.where(told, table.std, 1.0) ** 2) if table.covariance is None else table.covariance
+    )
     K, mean, names = coefficient_matrix(table.terms, bounds.dof), table.beta, ()
     own, kinds = np.zeros((bounds.dof, 0)), ()
     friction = table.friction
@@ -410,8 +412,10 @@ def _noise(
     if table.rmse is None:
         return np.zeros(table.dof)
     square = table.rmse**2
-    if table.evidence is None or table.method != "trajectory" or len(told) != len(table.beta) + (
-        table.evidence.whole.R[:, 0, len(table.beta) : -1].size
+    if (
+        table.evidence is None
+        or table.method != "trajectory"
+        or len(told) != len(table.beta) + (table.evidence.whole.R[:, 0, len(table.beta) : -1].size)
     ):
         return np.sqrt(square)
     whole, rank = table.evidence.whole, len(table.beta)

@@ -460,5 +460,6 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Conversion": conversion,
     "Excitation": excitation,
     "Ensemble": ensemble,
+    "Comparison": lambda found: found.sections(),
     "Demonstration": lambda result: result.sections,
 }

@@ -182,7 +182,9 @@ class Ensemble:
         """Whether an effect of `corrected` is a rotor of the model, which members have as `armature`."""
         assert self.corrected is not None
         drawn = any(name.startswith(f"effect_{i + 1}_") for name in self.names)
-        return self.corrected.effects[i].name == "armature" and not drawn and "armature" in self.friction_names
+        return (
+            self.corrected.effects[i].name == "armature" and not drawn and "armature" in self.friction_names
+        )
 
     def _coefficients(self, i: int, mean: Float[np.ndarray, " n"]) -> Float[np.ndarray, "count n"]:
         """Of an effect in every member."""
@@ -193,7 +195,13 @@ class Ensemble:
         return out
 
     def band(
-        self, motion: Recording, *, level: float = 0.9, measured: bool = True, members: int = 400, cutoff: float = 5.0
+        self,
+        motion: Recording,
+        *,
+        level: float = 0.9,
+        measured: bool = True,
+        members: int = 400,
+        cutoff: float = 5.0,
     ) -> tuple[Float[np.ndarray, " time"], Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"]]:
         """Times [s], and between which torques [N m] that of a motion lies with probability `level`.
 
@@ -266,7 +274,9 @@ class Ensemble:
             (change, viscous, coulomb, tuple(coefficients)),
         )
 
-    def mjx(self, model: str | Path | None = None, members: slice | Sequence[int] = slice(None)) -> tuple[Any, Any]:
+    def mjx(
+        self, model: str | Path | None = None, members: slice | Sequence[int] = slice(None)
+    ) -> tuple[Any, Any]:
         """Members as one MJX model whose leaves `LEAVES` have an axis in front, and `in_axes` for `jax.vmap`.
 
             model, in_axes = members.mjx()
@@ -286,7 +296,9 @@ class Ensemble:
             raise InputError(notes[0])
         leaves = self.leaves(source, members)
         # the first member's model decides what is compiled in
-        base = engine.put_model(_with_leaves(source.model, {name: values[0] for name, values in leaves.items()}))
+        base = engine.put_model(
+            _with_leaves(source.model, {name: values[0] for name, values in leaves.items()})
+        )
         stacked = base.tree_replace({name: jnp.asarray(values) for name, values in leaves.items()})
         axes = jax.tree_util.tree_map(lambda _: None, base)
         return stacked, axes.tree_replace(dict.fromkeys(leaves, 0))
@@ -334,7 +346,9 @@ class Ensemble:
         native = self._native(np.array([i]))
         names = ("damping", "frictionloss", "armature")
         arm = eqx.tree_at(
-            lambda a: tuple(getattr(a, name) for name in names), arm, tuple(jnp.asarray(native[name][0]) for name in names)
+            lambda a: tuple(getattr(a, name) for name in names),
+            arm,
+            tuple(jnp.asarray(native[name][0]) for name in names),
         )
         return write_parameters(source, arm, native["standard"][0])
 
@@ -440,7 +454,9 @@ class Ensemble:
                 extra=np.concatenate([friction.reshape(count, -1), coefficients], 1),
                 names=names + effects,
                 friction=document["friction"]["model"],
-                corrected=None if document["corrected"] is None else Corrected.from_json(document["corrected"]),
+                corrected=None
+                if document["corrected"] is None
+                else Corrected.from_json(document["corrected"]),
                 noise=np.array(document["noise"], float),
                 source=document["source"],
                 model_file=document["model_file"] or "",

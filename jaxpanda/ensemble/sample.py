@@ -61,7 +61,9 @@ def draw_ensemble(
     if not isinstance(found, Retrieval) and (Path(found) / CORRECTED).is_file():
         folder = Path(found)
         corrected, posterior = Corrected.load(folder), Posterior.load(folder)
-        draws = draw(posterior, _starts(posterior, np.asarray(corrected.arm.standard), seed), count, seed, **options)
+        draws = draw(
+            posterior, _starts(posterior, np.asarray(corrected.arm.standard), seed), count, seed, **options
+        )
         arm, source, model = corrected.arm, "diagnosis", str((folder / XML).resolve())
         model_friction = "none"
     else:

@@ -47,11 +47,9 @@ _INSIDE = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9)
 CHAINS, SWEEPS = 256, 400
 """Of chains side by side, and of sweeps that count of each."""
 _LEARNING = 2
-"""Rounds in which the spread of the draws is learnt, together as long as the one that counts."""
-_LINES = 12
-"""Lines of all links together in a sweep."""
-_OFTEN = (1, 2, 1)
-"""How often of what is told, of what is not, and of what is beside the links."""
+"""Rounds in which the spread of the draws is learnt, together half as long as the one that counts."""
+_LINES = 3
+"""Times in a sweep that lines of all links together are taken: one of what is told, two of what is not, one beside."""
 _TRIES = 10
 """Draws on one line; after as many a chain stays where it is, which leaves the distribution as it is too."""
 
@@ -194,7 +192,8 @@ def _of_pairs(
     pairs = [np.stack(free)[:, :, :most], np.stack(told)]
     blocks = [slice(first, first + wide) for first in range(0, 10 * dof - wide + 1, 10)]
     felt = [
-        np.stack([(B / size)[:, here] @ lines for here, lines in zip(blocks, kind, strict=True)]) for kind in pairs
+        np.stack([(B / size)[:, here] @ lines for here, lines in zip(blocks, kind, strict=True)])
+        for kind in pairs
     ]
     felt[0][:] = 0.0
     return pairs, felt
@@ -269,7 +268,7 @@ def draw(
         seed: of the random numbers.
         constraints: further ones on the links, as `jaxpanda.retrieve` takes them.
         chains: that run side by side.
-        sweeps: of each chain that count; as many again, at most, are thrown away before.
+        sweeps: of each chain that count; half as many are thrown away before.
         progress: called with (parts done, parts).
 
     Raises:
@@ -285,7 +284,7 @@ def draw(
     tick = progress or (lambda done, total: None)
     for part in range(_LEARNING):
         tick(part, _LEARNING + 1)
-        trace = _run(region, jnp.asarray(L), y, keys[part], kept, max(1, thin // _LEARNING))
+        trace = _run(region, jnp.asarray(L), y, keys[part], kept, max(1, thin // (2 * _LEARNING)))
         y, recent = trace[-1], np.asarray(trace)[kept // 2 :]
         L = _spread(np.moveaxis(recent, 1, 0).reshape(len(L), -1), region.told)
     tick(_LEARNING, _LEARNING + 1)
@@ -357,114 +356,145 @@ def _spread(y: Float[np.ndarray, "unknowns draws"], told: int) -> Float[np.ndarr
     return scale[:, None] * np.linalg.cholesky(C + 1e-9 * np.eye(n))
 
 
+class _Lines(eqx.Module):
+    """Directions: what their random numbers move."""
+
+    point: Float[Array, "*pairs some lines"]
+    """Of the unknowns, or of two neighbouring links'."""
+    r: Float[Array, "*pairs told lines"]
+    margin: Float[Array, "*pairs linear lines"]
+
+    def along(self, u: Float[Array, "lines lanes"]) -> tuple[Array, Array, Array]:
+        return self.point @ u, self.r @ u, self.margin @ u
+
+
 @eqx.filter_jit
 def _run(
     region: Region, L: Array, y: Array, key: Array, kept: int, thin: int
 ) -> Float[Array, "kept unknowns chains"]:
     """Sweeps of all chains, every `thin`-th state kept."""
-    m = region.told
+    m, dof = region.told, len(region.carried)
     follow = jnp.zeros_like(L[:, :m])
     if m:
         follow = jax.scipy.linalg.solve_triangular(L[:m, :m].T, L[:, :m].T, lower=False).T
-    told, free, root = region.Q @ follow, region.Q @ L[:, m:], L[:m, :m]
-    widths = (m, free.shape[1], region.beside.shape[1])
+    told, root, wide = region.Q @ follow, L[:m, :m], 10 * min(2, dof)
+    no_r = lambda lines: jnp.zeros((m, lines.shape[1]))
+    free = region.Q @ L[:, m:]
+    parts = [(told @ root, root), (free, no_r(free)), (free, no_r(free))]
+    whole = _stacked(
+        [_Lines(points, felt, region.rows @ points) for points, felt in parts if points.shape[1]]
+    )
+    beside = _Lines(region.beside, region.beside_felt, region.rows @ region.beside)
+    blocks = jnp.stack([region.rows[:, 10 * i : 10 * i + wide] for i in range(max(1, dof - 1))])
+    neighbours = [
+        _Lines(points[k], felt[k], blocks[k] @ points[k])
+        for points, felt in zip(region.pairs, region.felt, strict=True)
+        for k in range(len(blocks))
+    ]
+    places = jnp.tile(jnp.arange(len(blocks)), len(region.pairs))
+    pairs, counts = _stacked(neighbours)
 
     def sweep(state, key):
-        r, point = state
-        keys = jax.random.split(key, 4)
-        for kind in (0, 1):
-            r, point = _pairs(region, kind, r, point, keys[kind])
-        lines = jnp.concatenate([told @ root, free, region.beside], 1)
-        felt = jnp.concatenate([root, jnp.zeros((m, free.shape[1])), region.beside_felt], 1)
-        u = jax.vmap(lambda key: _groups(key, widths, point.shape[1]))(jax.random.split(keys[2], _LINES))
+        keys = jax.random.split(key, 3)
+        now = (places, pairs, counts, jax.random.split(keys[0], len(places)))
+        state = jax.lax.scan(lambda state, now: (_pair(region, *now, state), None), state, now)[0]
 
-        def line(state, now):
-            u, key = now
-            r, point = state
-            dp, dr = lines @ u, felt @ u
-            low, high = _linear_ends(region.rows, region.limits, point, dp)
-            good = lambda t: region.is_feasible(point + t * dp)
-            t = _along(good, low, high, jnp.sum(dr**2, 0), jnp.sum(r * dr, 0), key)
-            return (r + t * dr, point + t * dp), None
+        def once(state, key):
+            each = jax.random.split(key, len(whole[1]) + 1)
+            line = lambda state, now: (_line(region, *now, state), None)
+            state = jax.lax.scan(line, state, (*whole, each[1:]))[0]
+            return (_beside(beside, each[0], state) if beside.point.shape[1] else state), None
 
-        r, point = jax.lax.scan(line, (r, point), (u, jax.random.split(keys[2], _LINES)))[0]
-        if m:
-            r, point = _ellipse(region, told, r, point, keys[3])
-        return (r, point), None
+        state = jax.lax.scan(once, state, jax.random.split(keys[1], _LINES))[0]
+        return (_ellipse(region, told, region.rows @ told, state, keys[2]) if m else state), None
 
     def round_(state, key):
-        r, point = jax.lax.scan(sweep, state, jax.random.split(key, thin))[0]
+        r, point, _ = jax.lax.scan(sweep, state, jax.random.split(key, thin))[0]
         y = jnp.linalg.solve(region.Q, point - region.origin[:, None])  # rounding does not add up
-        return (y[:m], point), y
+        return (y[:m], point, region.rows @ point - region.limits[:, None]), y
 
-    start = (y[:m], region.origin[:, None] + region.Q @ y)
+    point = region.origin[:, None] + region.Q @ y
+    start = (y[:m], point, region.rows @ point - region.limits[:, None])
     return jax.lax.scan(round_, start, jax.random.split(key, kept))[1]
 
 
-def _directions(key: Array, lines: int, lanes: int) -> Float[Array, "lines lanes"]:
+def _stacked(families: Sequence[_Lines]) -> tuple[_Lines, Array]:
+    """All in one, padded to as many lines each, and how many each had."""
+    most = max(lines.point.shape[1] for lines in families)
+    counts = [lines.point.shape[1] for lines in families]
+    wide = [jax.tree.map(lambda x: jnp.pad(x, ((0, 0), (0, most - x.shape[1]))), lines) for lines in families]
+    return jax.tree.map(lambda *parts: jnp.stack(parts), *wide), jnp.asarray(counts)
+
+
+def _directions(key: Array, lines: int, used: Any, lanes: int) -> Float[Array, "lines lanes"]:
     """Half of them along one random number only, half along all together."""
-    k_normal, k_one, k_which = jax.random.split(key, 3)
-    normal = jax.random.normal(k_normal, (lines, lanes))
-    one = jax.nn.one_hot(jax.random.randint(k_one, (lanes,), 0, lines), lines, axis=0)
-    return jnp.where(jax.random.uniform(k_which, (lanes,)) < 0.5, normal, one * normal)
+    k_all, k_one, k_which = jax.random.split(key, 3)
+    every = jax.random.uniform(k_all, (lines, lanes), minval=-1.0)
+    one = jax.nn.one_hot(jax.random.randint(k_one, (lanes,), 0, used), lines, axis=0)
+    return jnp.where(jax.random.uniform(k_which, (lanes,)) < 0.5, every, one * every)
 
 
-def _groups(key: Array, widths: Sequence[int], lanes: int) -> Float[Array, "lines lanes"]:
-    """Directions within one group of lines, chosen for each chain."""
-    k_which, *keys = jax.random.split(key, 1 + len(widths))
-    groups = np.repeat(np.arange(len(widths)), [_OFTEN[i] * (width > 0) for i, width in enumerate(widths)])
-    which = jnp.asarray(groups)[jax.random.randint(k_which, (lanes,), 0, len(groups))]
-    parts = [
-        _directions(keys[i], width, lanes) * (which == i) if width else jnp.zeros((0, lanes))
-        for i, width in enumerate(widths)
-    ]
-    return jnp.concatenate(parts)
+_State = tuple[Array, Array, Array]
+"""r, the point, and the margins of what is linear; chains last."""
 
 
-def _pairs(region: Region, kind: int, r: Array, point: Array, key: Array) -> tuple[Array, Array]:
-    """A line in every two neighbouring links, one pair after the other."""
-    lines, felt = region.pairs[kind], region.felt[kind]
-    count, wide, k = lines.shape
+def _line(region: Region, lines: _Lines, used: Array, key: Array, state: _State) -> _State:
+    """A line of everything."""
+    r, point, margin = state
+    dp, dr, rate = lines.along(_directions(key, lines.point.shape[1], used, point.shape[1]))
+    low, high = _linear_ends(margin, rate)
+    good = lambda t: region.is_feasible(point + t * dp)
+    t = _along(good, low, high, jnp.sum(dr**2, 0), jnp.sum(r * dr, 0), jax.random.fold_in(key, 1))
+    return r + t * dr, point + t * dp, margin + t * rate
+
+
+def _beside(lines: _Lines, key: Array, state: _State) -> _State:
+    """A line of the unknowns beside the links, of which all that is asked is linear."""
+    r, point, margin = state
+    k = lines.point.shape[1]
+    dp, dr, rate = lines.along(_directions(key, k, k, point.shape[1]))
+    low, high = _linear_ends(margin, rate)
+    a, b = jnp.sum(dr**2, 0), jnp.sum(r * dr, 0)
+    t = _along(lambda t: t == t, low, high, a, b, jax.random.fold_in(key, 1))
+    return r + t * dr, point + t * dp, margin + t * rate
+
+
+def _pair(region: Region, i: Array, lines: _Lines, used: Array, key: Array, state: _State) -> _State:
+    """A line in two neighbouring links, the first of them the i-th."""
+    r, point, margin = state
+    wide, k = lines.point.shape
     dof = len(region.carried)
+    dp, dr, rate = lines.along(_directions(key, k, used, point.shape[1]))
+    low, high = _linear_ends(margin, rate)
+    here = jax.lax.dynamic_slice_in_dim(point, 10 * i, wide)
 
-    def pair(state, now):
-        i, D, E, key = now
-        r, point = state
-        u = _directions(key, k, point.shape[1])
-        dp, dr = D @ u, E @ u
-        here = jax.lax.dynamic_slice_in_dim(point, 10 * i, wide)
-        rows = jax.lax.dynamic_slice_in_dim(region.rows, 10 * i, wide, axis=1)
-        low, high = _linear_ends(region.rows, region.limits, point, dp, rows)
+    def good(t):
+        moved = here + t * dp
+        fits = region._are_feasible(moved.reshape(wide // 10, 10, -1), i)
+        if region.constraints:
+            whole = jax.lax.dynamic_update_slice_in_dim(point, moved, 10 * i, 0)
+            fits &= region._is_wanted(whole[: 10 * dof].reshape(dof, 10, -1))
+        return fits
 
-        def good(t):
-            moved = here + t * dp
-            fits = region._are_feasible(moved.reshape(wide // 10, 10, -1), i)
-            if region.constraints:
-                whole = jax.lax.dynamic_update_slice_in_dim(point, moved, 10 * i, 0)
-                fits &= region._is_wanted(whole[: 10 * dof].reshape(dof, 10, -1))
-            return fits
-
-        a, b = (jnp.sum(dr**2, 0), jnp.sum(r * dr, 0)) if kind else (0.0, 0.0)
-        t = _along(good, low, high, a, b, jax.random.fold_in(key, 1))
-        point = jax.lax.dynamic_update_slice_in_dim(point, here + t * dp, 10 * i, 0)
-        return (r + t * dr, point), None
-
-    now = (jnp.arange(count), lines, felt, jax.random.split(key, count))
-    return jax.lax.scan(pair, (r, point), now)[0]
+    t = _along(good, low, high, jnp.sum(dr**2, 0), jnp.sum(r * dr, 0), jax.random.fold_in(key, 1))
+    point = jax.lax.dynamic_update_slice_in_dim(point, here + t * dp, 10 * i, 0)
+    return r + t * dr, point, margin + t * rate
 
 
-def _ellipse(region: Region, told: Array, r: Array, point: Array, key: Array) -> tuple[Array, Array]:
-    """All that is told, and what follows it."""
-    k_normal, k_angle = jax.random.split(key)
-    nu = jax.random.normal(k_normal, r.shape)
+def _ellipse(region: Region, told: Array, felt: Array, state: _State, key: Array) -> _State:
+    """All that is told, and what follows it; `felt`: what the linear margins feel of r."""
+    r, point, margin = state
+    k_nu, k_angle = jax.random.split(key)
+    nu = jax.random.normal(k_nu, r.shape)
     along, across = told @ r, told @ nu
+    rate = felt @ r, felt @ nu
     moved = lambda angle: point + (jnp.cos(angle) - 1) * along + jnp.sin(angle) * across
+    margins = lambda angle: margin + (jnp.cos(angle) - 1) * rate[0] + jnp.sin(angle) * rate[1]
 
     def search(state):
         angle, left, right, done, i = state
         new = left + (right - left) * jax.random.uniform(jax.random.fold_in(k_angle, i), left.shape)
-        at = moved(new)
-        good = region.is_feasible(at) & jnp.all(region.rows @ at >= region.limits[:, None], 0)
+        good = region.is_feasible(moved(new)) & jnp.all(margins(new) >= 0, 0)
         angle = jnp.where(~done & good, new, angle)
         left = jnp.where(~done & ~good & (new < 0), new, left)
         right = jnp.where(~done & ~good & (new >= 0), new, right)
@@ -474,15 +504,13 @@ def _ellipse(region: Region, told: Array, r: Array, point: Array, key: Array) ->
     first = 2 * jnp.pi * jax.random.uniform(jax.random.fold_in(k_angle, _TRIES), zero.shape)
     start = (zero, first - 2 * jnp.pi, first, zero > 0, 0)
     angle = jax.lax.while_loop(lambda s: ~jnp.all(s[3]) & (s[4] < _TRIES), search, start)[0]
-    return r * jnp.cos(angle) + nu * jnp.sin(angle), moved(angle)
+    return r * jnp.cos(angle) + nu * jnp.sin(angle), moved(angle), margins(angle)
 
 
 def _linear_ends(
-    every: Array, limits: Array, point: Array, dp: Array, rows: Array | None = None
+    margin: Float[Array, "linear lanes"], rate: Float[Array, "linear lanes"]
 ) -> tuple[Array, Array]:
-    """Between which steps a line stays within what is linear; `rows`: the columns of `every` that dp has."""
-    margin = every @ point - limits[:, None]
-    rate = (every if rows is None else rows) @ dp
+    """Between which steps a line stays within what is linear."""
     at = -jnp.maximum(margin, 0.0) / jnp.where(rate == 0, 1.0, rate)
     low = jnp.max(jnp.where(rate > 0, at, -jnp.inf), 0)
     high = jnp.min(jnp.where(rate < 0, at, jnp.inf), 0)
