@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from .recordings import Recording as Recording
     from .recordings import load as load
     from .recordings import save as save
+    from .rehearsal import Rehearsal as Rehearsal
+    from .rehearsal import rehearse as rehearse
     from .retrieval import Retrieval as Retrieval
     from .retrieval import retrieve as retrieve
     from .rollout import replay as replay
@@ -56,6 +58,7 @@ _HOME = {
     "InputError": "errors",
     "Reading": "reading",
     "Recording": "recordings",
+    "Rehearsal": "rehearsal",
     "Retrieval": "retrieval",
     "compare": "comparison",
     "demonstrate": "demo",
@@ -69,6 +72,7 @@ _HOME = {
     "inspect": "inspection",
     "load": "recordings",
     "prepare": "signals",
+    "rehearse": "rehearsal",
     "replay": "rollout",
     "retrieve": "retrieval",
     "save": "recordings",

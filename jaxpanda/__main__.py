@@ -466,6 +466,40 @@ class Compare:
         return comparison.compare_files(self.out, self.a, self.b, self.motion)
 
 
+@dataclasses.dataclass(frozen=True)
+class Rehearse:
+    """What a motion would recover of an arm, to which precision, and which faults it would show; in simulation."""
+
+    motion: Path
+    """The motion: a recording with or without torque, such as excitation.csv."""
+    out: Path
+    """Folder for rehearsal.json."""
+    model: Path | None = None
+    """The arm (MJCF); without it, the project's own Panda."""
+    draws: int = 3
+    """Of the sensors' noise, each identified."""
+    seed: int = 0
+    torque_noise: tuple[float, ...] = ()
+    """Of the torque sensors, one for all joints or one a joint [N m]."""
+    diagnose: bool = False
+    """Plant a fault, too, and diagnose it; takes a minute more."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import rehearsal
+
+        return rehearsal.rehearse_files(
+            self.out,
+            self.model,
+            self.motion,
+            draws=self.draws,
+            seed=self.seed,
+            torque_noise=self.torque_noise,
+            diagnose=self.diagnose,
+        )
+
+
 _COMMANDS = (
     Demo,
     Inspect,
@@ -480,6 +514,7 @@ _COMMANDS = (
     Excite,
     Ensemble,
     Compare,
+    Rehearse,
 )
 
 

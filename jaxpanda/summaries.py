@@ -461,5 +461,6 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Excitation": excitation,
     "Ensemble": ensemble,
     "Comparison": lambda found: found.sections(),
+    "Rehearsal": lambda found: found.sections(),
     "Demonstration": lambda result: result.sections,
 }
