@@ -468,7 +468,7 @@ class Compare:
 
 @dataclasses.dataclass(frozen=True)
 class Rehearse:
-    """What a motion would recover of an arm, to which precision, and which faults it would show; in simulation."""
+    """What a motion would recover of an arm, how precisely, and which faults it would show; in simulation."""
 
     motion: Path
     """The motion: a recording with or without torque, such as excitation.csv."""

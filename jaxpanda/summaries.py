@@ -423,8 +423,8 @@ def ensemble(found: Any) -> Sequence[Section]:
     between = lambda low, middle, high: f"{middle:.4g} ({low:.4g} to {high:.4g})"
     sentences = [
         f"{document['count']} members, each of which could be built; {mixing['chains']} chains of "
-        f"{mixing['sweeps']} sweeps, R-hat {mixing['rhat']:.3f} at most, {mixing['effective']:.0f} independent draws "
-        f"at least; {document['seconds']:.1f} s.",
+        f"{mixing['sweeps']} sweeps, R-hat {mixing['rhat']:.3f} at most, {mixing['effective']:.0f} independent "
+        f"draws at least; {document['seconds']:.1f} s.",
         f"Total mass {between(*total)} kg. In brackets 5 % and 95 % of the members.",
     ]
     rows = [

@@ -63,7 +63,8 @@ def test_every_member_can_be_built_within_bounds(folder, members):
     for values, box in ((mass, bounds.mass), (com, bounds.com), (six, bounds.inertia)):
         assert np.all((values >= box[..., 0] - 1e-9) & (values <= box[..., 1] + 1e-9))
     assert np.all(np.abs(mass.sum(1) - bounds.total_mass.mean()) <= np.ptp(bounds.total_mass) / 2 + 1e-9)
-    assert np.all(members.own("viscous") >= 0) and np.all(members.own("coulomb") >= 0)
+    assert np.all(members.own("viscous") >= 0)
+    assert np.all(members.own("coulomb") >= 0)
 
 
 @SLOW
@@ -199,7 +200,8 @@ def test_command_leaves_what_it_says(folder, members, tmp_path, capsys):
     assert result(out / "ensemble.json")["count"] == document["count"] == 256
     assert (out / "member_1.xml").is_file()
     again = Ensemble.load(out)
-    assert again.count == 256 and again.names == members.names
+    assert again.count == 256
+    assert again.names == members.names
     motion = recorded(3, seconds=4.0)
     assert np.allclose(again.torque(motion, [0])[1], again.torque(motion, slice(0, 1))[1])
     mass = np.load(out / "ensemble.npz")["mass"]
@@ -218,7 +220,8 @@ def test_command_leaves_what_it_says(folder, members, tmp_path, capsys):
 def test_bad_usage_is_one_sentence(tmp_path, capsys, given, said):
     assert main(["ensemble", *given, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
+    assert said in error
+    assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 

@@ -1,7 +1,7 @@
 """Coverage of an ensemble's bands: how often torque of motions that were not identified lies within them.
 
-Virtual Pandas with links that differ from the model's, friction and sensors like the real ones; each is identified
-from one random motion and asked about another. README.md has the question and the answer.
+Virtual Pandas with links that differ from the model's, friction and sensors like the real ones; each is
+identified from one random motion and asked about another. README.md has the question and the answer.
 """
 
 import argparse
@@ -44,7 +44,8 @@ def main() -> None:
     for name in ("measured", "measured_of_mean", "true"):
         values = [row[name] for row in rows]
         print(
-            f"{name}: {100 * np.mean(values):.1f} % of samples, {100 * min(values):.1f} to {100 * max(values):.1f} by arm"
+            f"{name}: {100 * np.mean(values):.1f} % of samples,"
+            f" {100 * min(values):.1f} to {100 * max(values):.1f} by arm"
         )
 
 

@@ -1,13 +1,13 @@
 r"""`compare`: whether two results agree beyond their uncertainty, and what explains where they do not.
 
 With the difference d of what both tell, and its covariance $S = C_a + C_b$ for recordings that are independent,
-$\chi^2 = d^\top S^{-1} d$ weighs all of it at once. Covariances are estimated from a few blocks of time: $\chi^2/n$
-is held against an F distribution and single differences against Student's t, whose tails allow for that. Single
-ones are corrected for their number by Holm's method.
+$\chi^2 = d^\top S^{-1} d$ weighs all of it at once. Covariances are estimated from a few blocks of time:
+$\chi^2/n$ is held against an F distribution and single differences against Student's t, whose tails allow for
+that. Single ones are corrected for their number by Holm's method.
 
-Explanations are laws of few parameters, $d = D\theta + e$: another friction at one joint, another body on the last
-link, one link that differs, another scale of all torque. The one that takes most from $\chi^2$ beyond what its own
-parameters are expected to is taken, and another after it, as long as what is left does not agree.
+Explanations are laws of few parameters, $d = D\theta + e$: another friction at one joint, another body on the
+last link, one link that differs, another scale of all torque. The one that takes most from $\chi^2$ beyond what
+its own parameters are expected to is taken, and another after it, as long as what is left does not agree.
 
 References:
     Holm, "A simple sequentially rejective multiple test procedure", Scandinavian J. Statistics 1979.
@@ -114,8 +114,8 @@ def _check_arms(a: Known, b: Known) -> None:
         for name in ("R", "p", "prismatic")
     ):
         raise InputError(
-            f"{a.folder}, {b.folder}: are of arms of different geometry ({a.arm.name}, {b.arm.name}); two results of"
-            " one arm are needed"
+            f"{a.folder}, {b.folder}: are of arms of different geometry ({a.arm.name}, {b.arm.name}); two"
+            " results of one arm are needed"
         )
 
 
@@ -335,7 +335,7 @@ def _torque(
     names: Sequence[str],
     motion: Recording | None,
 ) -> dict[str, Any]:
-    """By how much the two differ in the torque of one motion [N m, rms by joint], and what is expected of that."""
+    """By how much the two differ in the torque of one motion [N m, rms by joint], and what is expected of it."""
     arm = a.arm
     given = motion or common_motion(arm)
     given.require_dof(arm.dof)

@@ -79,7 +79,8 @@ def _identification(folder: Path) -> Known:
     C = found.joint_covariance if found.joint_covariance is not None else found.covariance
     if C is None or arm is None:
         raise InputError(
-            f"{folder / IDENTIFICATION}: has no covariance or no arm, as an older version or a bare table; identify again"
+            f"{folder / IDENTIFICATION}: has no covariance or no arm, as an older version or a bare table;"
+            " identify again"
         )
     names: tuple[str, ...] = ()
     mean = found.beta

@@ -57,7 +57,8 @@ class Explanation:
             "link": f"link {self.joint} differs",
             "torque_scale": "all torque has another scale",
         }[self.what]
-        return f"{where[0].upper()}{where[1:]}{': ' + sizes if sizes else ''} (chi-square falls by {self.gained:.0f})."
+        sizes = f": {sizes}" if sizes else ""
+        return f"{where[0].upper()}{where[1:]}{sizes} (chi-square falls by {self.gained:.0f})."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,8 +130,8 @@ def sections(found: Comparison, *, page: bool = False) -> Sequence[Section]:
         if agree
         else f"The two {found.kind} results differ beyond their uncertainty.",
         f"A is {found.a}, B is {found.b}.",
-        f"All {found.count} parameters that both tell: chi-square {found.chi_squared:.1f}, probability {found.p:.2g} "
-        "where nothing differs.",
+        f"All {found.count} parameters that both tell: chi-square {found.chi_squared:.1f}, "
+        f"probability {found.p:.2g} where nothing differs.",
         *(one.sentence() for one in found.explanations),
     ]
     if not agree and not found.explanations and any(one.differs for one in found.parameters):

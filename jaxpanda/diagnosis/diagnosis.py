@@ -40,8 +40,8 @@ from .host import on_host
 from .localise import Localisation, localise, unbiased
 from .meaning import Misread, misread
 from .next_motion import NextMotion, next_motion
-from .premises import Premises, settled
 from .posterior import posterior_of
+from .premises import Premises, settled
 from .problem import FOLDS, Problem
 from .resting import AtRest, judge, rests
 from .search import transferable
@@ -160,7 +160,8 @@ class Diagnosis:
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
         """Write diagnosis.json, corrected.xml with what it includes, corrected.json, and posterior.npz;
-        next_motion.csv where one would decide. What corrected.xml will not find there comes back, a sentence each.
+        next_motion.csv where one would decide. What corrected.xml will not find there comes back, a sentence
+        each.
 
         Raises:
             InputError: a file of such a name stands there that no earlier diagnosis left; nothing is written.

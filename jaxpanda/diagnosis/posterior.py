@@ -19,8 +19,8 @@ _EXACT = 1e-6
 
 
 def posterior_of(found: "Diagnosis") -> Posterior:
-    """The Gaussian of the refitted numbers of the model and of the coefficients of its effects, these in the order
-    of the corrected model; the shapes of effects stay as they were found."""
+    """The Gaussian of the refitted numbers of the model and of the coefficients of its effects, these in the
+    order of the corrected model; the shapes of effects stay as they were found."""
     arm, kept = found.corrected.arm, found.kept
     dof, inertial = arm.dof, found.spread.shape[1]
     bounds, nominal = Bounds.of(arm), np.asarray(arm.standard)

@@ -169,7 +169,7 @@ def _under_noise(design: Design) -> Float[np.ndarray, "n n"]:
 
 
 def joint(design: Design) -> Float[np.ndarray, "n n"]:
-    r"""Covariance of all unknowns of a design, of full rank: the jackknife's, shrunk, and what the prior leaves open.
+    r"""Covariance of all unknowns of a design, of full rank: the jackknife's, shrunk, and what the prior leaves.
 
     $\hat x - x = H^{-1}(A^\top e - P x)$, so that to the data's part comes $H^{-1} P H^{-1}$.
     """

@@ -62,7 +62,7 @@ class Ensemble:
     extra: Float[np.ndarray, "count extra"]
     """What was drawn with the links."""
     names: tuple[str, ...]
-    """Of `extra`: `viscous_1` and other friction by joint, `effect_1_1` by effect of `corrected` and coefficient."""
+    """Of `extra`: `viscous_1` and other friction by joint, `effect_1_1` by effect of `corrected` and number."""
     friction: str
     """A model of `jaxpanda.friction`, of what comes beyond the arm's own friction; "none" for a diagnosis."""
     corrected: Corrected | None
@@ -496,7 +496,7 @@ def _with_leaves(model: mujoco.MjModel, leaves: dict[str, np.ndarray]) -> mujoco
 def _bodies_of(
     source: MjcfSource, standard: Float[np.ndarray, "members dof 10"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Mass, centre of mass, principal moments and axes of the links' own bodies, what they carry left to itself."""
+    """Mass, centre of mass, principal moments and axes of the links' own bodies, without what they carry."""
     from scipy.spatial.transform import Rotation
 
     parts = []
@@ -508,7 +508,8 @@ def _bodies_of(
     if not np.all(mass > 0):
         i = int(np.argmin(mass.min(0)))
         raise InputError(
-            f"{source.path}: what is fixed to {source.links[i].body} weighs more than the link with it in some member"
+            f"{source.path}: what is fixed to {source.links[i].body} weighs more than the link"
+            " with it in some member"
         )
     moments, axes = np.linalg.eigh(I)
     axes[..., 0] *= np.linalg.det(axes)[..., None]

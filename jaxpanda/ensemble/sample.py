@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ..arm import Arm
 from ..corrected import FILE as CORRECTED
 from ..corrected import XML, Corrected
 from ..errors import InputError, require_x64

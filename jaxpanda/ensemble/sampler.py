@@ -3,26 +3,27 @@ r"""Draws of links and friction from a posterior, by hit-and-run with many chain
 $$p(\phi, f) \propto \exp\bigl(-\tfrac12 \lVert G(\phi, f) - \mu\rVert^2_{C^{-1}}\bigr)\,
    1[\text{every link can be built, all within bounds}]$$
 
-In coordinates $y = (r, z)$ the told part is $r \sim N(0, 1)$ and nothing tells of z, so that p is flat in it. A move
-takes a random line through where a chain stands, and draws the next point from p on that line: a Gaussian, or a
-uniform, cut to the line's feasible part. Bounds that are linear cut it at once; the others (pseudo-inertias, bounds
-on inertias about the centre of mass, a user's constraints) by shrinking: a draw that is not feasible ends the line
-there, on its side, and the draw is made again. A sweep has four kinds of move:
+In coordinates $y = (r, z)$ the told part is $r \sim N(0, 1)$ and nothing tells of z, so that p is flat in it. A
+move takes a random line through where a chain stands, and draws the next point from p on that line: a Gaussian,
+or a uniform, cut to the line's feasible part. Bounds that are linear cut it at once; the others (pseudo-inertias,
+bounds on inertias about the centre of mass, a user's constraints) by shrinking: a draw that is not feasible ends
+the line there, on its side, and the draw is made again. A sweep has four kinds of move:
 
 - two neighbouring links, along what nothing tells: mass, first moment and inertia about their common joint's axis
   that one may have instead of the other. A line that moves two links is cut by the constraints of two;
 - two neighbouring links, along anything, by the Gaussian on that line;
 - everything, along what nothing tells; what is told, in one direction, z following; or what is beside the links;
-- everything that is told at once, on an ellipse $r\cos\theta + \nu\sin\theta$ with $\nu \sim N(0, 1)$, z following as
-  it does in the draws so far. How it does is learnt in rounds that are thrown away; then it stays.
+- everything that is told at once, on an ellipse $r\cos\theta + \nu\sin\theta$ with $\nu \sim N(0, 1)$, z
+  following as it does in the draws so far. How it does is learnt in rounds that are thrown away; then it stays.
 
-Arrays have the chains as their last, contiguous axis: the small algebra of many links is written out entry by entry.
+Arrays have the chains as their last, contiguous axis: the small algebra of many links is written out entry by
+entry.
 
 References:
     Smith, "Efficient Monte Carlo procedures for generating points uniformly distributed over bounded regions",
     Operations Research 1984 (hit-and-run); Neal, "Slice sampling", Annals of Statistics 2003 (shrinkage);
-    Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010; Vehtari et al., "Rank-normalization, folding,
-    and localization: an improved R-hat", Bayesian Analysis 2021.
+    Murray, Adams, MacKay, "Elliptical slice sampling", AISTATS 2010; Vehtari et al., "Rank-normalization,
+    folding, and localization: an improved R-hat", Bayesian Analysis 2021.
 """
 
 import dataclasses
@@ -49,7 +50,7 @@ CHAINS, SWEEPS = 256, 400
 _LEARNING = 2
 """Rounds in which the spread of the draws is learnt, together half as long as the one that counts."""
 _LINES = 3
-"""Times in a sweep that lines of all links together are taken: one of what is told, two of what is not, one beside."""
+"""Times in a sweep that lines of all links are taken: one of what is told, two of what is not, one beside."""
 _TRIES = 10
 """Draws on one line; after as many a chain stays where it is, which leaves the distribution as it is too."""
 
@@ -314,8 +315,10 @@ def _inside(
 ) -> Float[Array, "unknowns chains"]:
     """Where chains begin, each strictly inside, in the region's coordinates."""
     dof = posterior.dof
-    extra = np.linalg.lstsq(posterior.told[:, 10 * dof :], posterior.mean - posterior.told[:, : 10 * dof] @
-                            starts[0].ravel(), rcond=None)[0] if len(posterior.least) else np.zeros(0)  # fmt: skip
+    extra = np.zeros(len(posterior.least))
+    if len(extra):
+        left = posterior.mean - posterior.told[:, : 10 * dof] @ starts[0].ravel()
+        extra = np.linalg.lstsq(posterior.told[:, 10 * dof :], left, rcond=None)[0]
     extra = np.maximum(extra, np.where(np.isfinite(posterior.least), posterior.least + 1e-9, -np.inf))
     flat = starts.reshape(len(starts), -1)
     middle = flat.mean(0)
@@ -409,7 +412,7 @@ def _run(
         return (_ellipse(region, told, region.rows @ told, state, keys[2]) if m else state), None
 
     def round_(state, key):
-        r, point, _ = jax.lax.scan(sweep, state, jax.random.split(key, thin))[0]
+        _r, point, _ = jax.lax.scan(sweep, state, jax.random.split(key, thin))[0]
         y = jnp.linalg.solve(region.Q, point - region.origin[:, None])  # rounding does not add up
         return (y[:m], point, region.rows @ point - region.limits[:, None]), y
 

@@ -89,7 +89,7 @@ def shrunk(
     r"""The jackknife's covariance, drawn towards the shape of $H^{-1}$ as far as its few blocks require.
 
     B blocks span B - 1 directions of the unknowns: of the others the jackknife says that they are known exactly.
-    In coordinates in which $H = 1$, with $z_b = \sqrt{B - 1}\,(\Delta_b - \bar\Delta)$ and $S = \sum z_b z_b^\top / B$,
+    Where $H = 1$, with $z_b = \sqrt{B - 1}\,(\Delta_b - \bar\Delta)$ and $S = \sum z_b z_b^\top / B$,
 
     $$\mathrm{cov} = (1 - \rho)\,S + \rho\,\tfrac{\mathrm{tr} S}{n}\,1, \qquad
       \rho = \min\Bigl(1, \frac{\sum_b \lVert z_b z_b^\top - S\rVert^2 / B^2}

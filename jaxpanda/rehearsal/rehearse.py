@@ -188,7 +188,9 @@ def _rows(found: Sequence, truth: Arm, friction: JointFriction) -> list[Row]:
     first = found[0]
     rows = []
     if any(one.expressions != first.expressions for one in found):
-        raise InputError("the motion shows some parameters so weakly that their number changes with the noise")
+        raise InputError(
+            "the motion shows some parameters so weakly that their number changes with the noise"
+        )
     for i, text in enumerate(first.expressions):
         values = np.array([one.beta[i] for one in found])
         std = np.array([one.std[i] for one in found])
@@ -228,7 +230,7 @@ def _as_known(truth: Arm, friction: JointFriction) -> Arm:
 
 
 def _faults(recording: Recording, arm: Arm) -> list[Fault]:
-    """The least size of every effect that a diagnosis of this recording would find, beside what it would refit."""
+    """The least size of every effect that a diagnosis of this recording would find, beside what it refits."""
     premises = pose((prepare_trace(recording, arm),), (True,), "identified")
     state = start(premises.problem)
     return [
@@ -255,7 +257,9 @@ def _diagnosed(
     seed: int,
 ) -> dict:
     """The user's arm with one more friction, and what a diagnosis says of it."""
-    seen = [f for f in faults if f.effect == "coulomb_friction" and f.size is not None and f.joint is not None]
+    seen = [
+        f for f in faults if f.effect == "coulomb_friction" and f.size is not None and f.joint is not None
+    ]
     if not seen:
         return {"planted": None, "findings": [], "found": False}
     fault = sorted(seen, key=lambda f: f.size or 0.0)[len(seen) // 2]
@@ -277,7 +281,12 @@ def _diagnosed(
         for f in getattr(found, "findings", ())
     ]
     return {
-        "planted": {"effect": fault.effect, "joint": fault.joint, "size": float(level.max()), "unit": fault.unit},
+        "planted": {
+            "effect": fault.effect,
+            "joint": fault.joint,
+            "size": float(level.max()),
+            "unit": fault.unit,
+        },
         "findings": findings,
         "found": any(f["effect"] == fault.effect and fault.joint in f["joints"] for f in findings),
     }

@@ -101,15 +101,16 @@ class Rehearsal:
         """As a terminal shows it."""
         told = sum(one.told for one in self.parameters)
         sentences = [
-            f"{self.motion}, {self.seconds:.1f} s, simulated with links and friction that the analysis was not told: "
-            f"{told} of {len(self.parameters)} base parameters would be known to 30 % or better (rank {self.rank}, "
-            f"condition number {number(self.condition_number)}), {self.relative_error_percent:.2g} % of torque left.",
+            f"{self.motion}, {self.seconds:.1f} s, simulated with links and friction that the analysis was not "
+            f"told: {told} of {len(self.parameters)} base parameters would be known to 30 % or better (rank "
+            f"{self.rank}, condition number {number(self.condition_number)}), {self.relative_error_percent:.2g} "
+            "% of torque left.",
         ]
         if self.diagnosed is not None and (planted := self.diagnosed["planted"]):
             found = "was found" if self.diagnosed["found"] else "was not found"
             sentences.append(
-                f"{planted['effect'].replace('_', ' ')} of {planted['size']:.3g} {planted['unit']} planted at joint "
-                f"{planted['joint']} {found} by a diagnosis."
+                f"{planted['effect'].replace('_', ' ')} of {planted['size']:.3g} {planted['unit']} planted at "
+                f"joint {planted['joint']} {found} by a diagnosis."
             )
         row = lambda one: [
             one.name if one.joint is None else f"{one.name} of joint {one.joint}",
@@ -123,9 +124,7 @@ class Rehearsal:
         by_effect: dict[str, list[Fault]] = {}
         for fault in self.faults:
             by_effect.setdefault(fault.effect, []).append(fault)
-        faults = [
-            [effect.replace("_", " "), *self._least(several)] for effect, several in by_effect.items()
-        ]
+        faults = [[effect.replace("_", " "), *self._least(several)] for effect, several in by_effect.items()]
         tables = [
             Table(heads, [row(one) for one in self.parameters], "Base parameters [kg m², kg m]"),
             Table(heads, [row(one) for one in self.friction], "Friction"),
@@ -138,9 +137,19 @@ class Rehearsal:
         return [Section("Rehearsal", [*sentences, *self.notes], tables)]
 
     def _least(self, several: Sequence[Fault]) -> list[str]:
-        shown = sorted((one for one in several if one.rms_torque is not None), key=lambda one: one.rms_torque or 0.0)
-        never = ", ".join("arm" if one.joint is None else str(one.joint) for one in several if one.rms_torque is None)
+        shown = sorted(
+            (one for one in several if one.rms_torque is not None), key=lambda one: one.rms_torque or 0.0
+        )
+        never = ", ".join(
+            "arm" if one.joint is None else str(one.joint) for one in several if one.rms_torque is None
+        )
         if not shown:
             return ["–", "", "–", "", never]
         name = lambda one: "arm" if one.joint is None else str(one.joint)
-        return [number(shown[0].rms_torque, 2), name(shown[0]), number(shown[-1].rms_torque, 2), name(shown[-1]), never]
+        return [
+            number(shown[0].rms_torque, 2),
+            name(shown[0]),
+            number(shown[-1].rms_torque, 2),
+            name(shown[-1]),
+            never,
+        ]
