@@ -22,7 +22,7 @@ from jaxpanda.posterior import Posterior
 from jaxpanda.signals import prepare
 from jaxpanda.simulation import JointFriction, Sensors, perturbed, random_trajectory, simulate
 
-FEW = {"chains": 64, "sweeps": 60}
+CHAINS, SWEEPS = 64, 60
 FRICTION = JointFriction(viscous=0.5, coulomb=0.3, offset=0.1, width=0.005)
 SENSORS = Sensors(torque_noise=0.05, torque_correlation_time=0.02)
 
@@ -51,12 +51,15 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def members(folder):
-    return draw_ensemble(folder / "run", count=256, seed=0, **FEW)
+    return draw_ensemble(folder / "run", count=256, seed=0, chains=CHAINS, sweeps=SWEEPS)
 
 
 @SLOW
 def test_every_member_can_be_built_within_bounds(folder, members):
-    bounds = Retrieval.load(folder / "run").posterior.bounds
+    posterior = Retrieval.load(folder / "run").posterior
+    assert posterior is not None
+    bounds = posterior.bounds
+    assert bounds.total_mass is not None
     mass, com, six = members.bodies()
     J = np.asarray(jax.vmap(jax.vmap(inertia.pseudo_inertia))(jnp.asarray(members.standard)))
     assert np.all(np.linalg.eigvalsh(J)[..., 0] > 0)
