@@ -84,9 +84,9 @@ class Region(eqx.Module):
     low: Float[Array, "dof 6"]
     """Bounds of xx, xy, yy, xz, yz, zz about the centre of mass."""
     high: Float[Array, "dof 6"]
-    pairs: tuple[Float[Array, "pairs wide lines"], ...]
+    pairs: tuple[Float[Array, "pairs wide _lines"], ...]
     """For each kind of line, the parameters of two neighbours that its random numbers move."""
-    felt: tuple[Float[Array, "pairs told lines"], ...]
+    felt: tuple[Float[Array, "pairs told _lines"], ...]
     """The same in r."""
     beside: Float[Array, "unknowns extra"]
     """Lines of the unknowns beside the links."""
