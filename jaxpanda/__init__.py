@@ -16,11 +16,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     __version__: str
     from .arm import Arm as Arm
+    from .comparison import Comparison as Comparison
+    from .comparison import compare as compare
     from .corrected import Corrected as Corrected
     from .demo import demonstrate as demonstrate
     from .diagnosis import Diagnosis as Diagnosis
     from .diagnosis import diagnose as diagnose
     from .diagnosis import predict as predict
+    from .ensemble import Ensemble as Ensemble
+    from .ensemble import draw_ensemble as draw_ensemble
     from .errors import InputError as InputError
     from .excitation import excite as excite
     from .feasible import Bounds as Bounds
@@ -37,6 +41,8 @@ if TYPE_CHECKING:
     from .recordings import Recording as Recording
     from .recordings import load as load
     from .recordings import save as save
+    from .rehearsal import Rehearsal as Rehearsal
+    from .rehearsal import rehearse as rehearse
     from .retrieval import Retrieval as Retrieval
     from .retrieval import retrieve as retrieve
     from .rollout import replay as replay
@@ -47,18 +53,23 @@ if TYPE_CHECKING:
 _HOME = {
     "Arm": "arm",
     "Bounds": "feasible",
+    "Comparison": "comparison",
     "Corrected": "corrected",
     "Diagnosis": "diagnosis",
+    "Ensemble": "ensemble",
     "Identification": "identification",
     "InputError": "errors",
     "ModelFile": "model_file",
     "Part": "model_file",
     "Reading": "reading",
     "Recording": "recordings",
+    "Rehearsal": "rehearsal",
     "Retrieval": "retrieval",
+    "compare": "comparison",
     "demonstrate": "demo",
     "diagnose": "diagnosis",
     "diagnose_fleet": "fleet",
+    "draw_ensemble": "ensemble",
     "estimate_payload": "payload",
     "excite": "excitation",
     "predict": "diagnosis",
@@ -67,6 +78,7 @@ _HOME = {
     "inspect": "inspection",
     "load": "recordings",
     "prepare": "signals",
+    "rehearse": "rehearsal",
     "replay": "rollout",
     "retrieve": "retrieval",
     "save": "recordings",

@@ -427,6 +427,96 @@ class Excite:
 
 
 @dataclasses.dataclass(frozen=True)
+class Ensemble:
+    """Arms that recordings cannot tell apart, each of which could be built: links, friction, effects."""
+
+    out: Path
+    """Folder for ensemble.json, ensemble.npz and member_1.xml, ..."""
+    retrieval: Path | None = None
+    """Folder that `retrieve` wrote."""
+    diagnosis: Path | None = None
+    """Folder that `diagnose` wrote, instead."""
+    count: int = 1000
+    """Members."""
+    seed: int = 0
+    mjcf: int = 0
+    """How many members, the first ones, to write as MJCF too."""
+    sweeps: int = 400
+    """Of each chain; more where the result says that chains have not mixed."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import ensemble
+
+        return ensemble.ensemble_files(
+            self.out,
+            self.retrieval,
+            self.diagnosis,
+            count=self.count,
+            seed=self.seed,
+            mjcf=self.mjcf,
+            sweeps=self.sweeps,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Compare:
+    """Whether two results of identify, retrieve or diagnose agree, and what explains where they do not."""
+
+    a: tyro.conf.Positional[Path]
+    """Folder of one result."""
+    b: tyro.conf.Positional[Path]
+    """Folder of another, of the same arm."""
+    out: Path
+    """Folder for comparison.json and comparison.html."""
+    motion: Path | None = None
+    """On which the torque of both is compared; without it one within the joints' ranges."""
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import comparison
+
+        return comparison.compare_files(self.out, self.a, self.b, self.motion)
+
+
+@dataclasses.dataclass(frozen=True)
+class Rehearse:
+    """What a motion would recover of an arm, how precisely, and which faults it would show; in simulation."""
+
+    motion: Path
+    """The motion: a recording with or without torque, such as excitation.csv."""
+    out: Path
+    """Folder for rehearsal.json."""
+    model: Path | None = None
+    """The arm (MJCF or URDF); without it, the project's own Panda."""
+    draws: int = 3
+    """Of the sensors' noise, each identified."""
+    seed: int = 0
+    torque_noise: tuple[float, ...] = ()
+    """Of the torque sensors, one for all joints or one a joint [N m]."""
+    diagnose: bool = False
+    """Plant a fault, too, and diagnose it; takes a minute more."""
+    part: _Part = WHOLE
+    json: bool = False
+    """Print the main result as one JSON document and nothing else."""
+
+    def run(self) -> Any:
+        from . import rehearsal
+
+        return rehearsal.rehearse_files(
+            self.out,
+            self.part.of_any(self.model),
+            self.motion,
+            draws=self.draws,
+            seed=self.seed,
+            torque_noise=self.torque_noise,
+            diagnose=self.diagnose,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class Fleet:
     """Many recordings of many arms: each diagnosed, and each arm's together: for good, drifting, once."""
 
@@ -477,6 +567,9 @@ _COMMANDS = (
     Payload,
     Convert,
     Excite,
+    Ensemble,
+    Compare,
+    Rehearse,
     Fleet,
 )
 

@@ -19,10 +19,11 @@ from .errors import InputError
 from .feasible import Bounds, Constraint, Links, Solutions, exact_penalty, solve
 from .feasible.bounds import INERTIA
 from .feasible.buildable import doubts, reach
+from .feasible.nearest import are_buildable
 from .feasible.schedule import Device
 from .feasible.solver import NOTHING, STARTS
 from .files import Kind, finite, output_folder, settle, write_json, write_npz
-from .friction import Friction
+from .friction import DISSIPATIVE, MODELS, Friction
 from .identification import Identification
 from .identification.condensed import Evidence, least_friction, own_parameters, with_own_parameters
 from .identification.result import known_physics
@@ -30,6 +31,8 @@ from .inputs import read_json, read_npz
 from .model_file import WHOLE, Part
 from .panda import is_panda, panda
 from .parameters import coefficient_matrix
+from .posterior import FILE as POSTERIOR_FILE
+from .posterior import Posterior, named
 
 SCHEMA = "jaxpanda.retrieval/1"
 FILE = "retrieval.json"
@@ -105,6 +108,10 @@ class Retrieval:
     """What the user should know before relying on this."""
     solutions: Solutions | None = None
     """Every start's outcome."""
+    posterior: Posterior | None = None
+    """What `jaxpanda.ensemble` draws from; None where the coefficients have no standard deviations."""
+    model: Arm | None = None
+    """The arm that was identified, with its nominal parameters, where that is known."""
 
     @property
     def dof(self) -> int:
@@ -142,6 +149,7 @@ class Retrieval:
             "weighting": self.weighting,
             "model_file": self.model_file or None,
             "model_part": self.model_part.to_json(),
+            "model": None if self.model is None else self.model.to_json(),
             "rmse": [] if self.rmse is None else self.rmse.tolist(),
             "relative_error_percent": self.relative_error_percent,
             "cross_validated_rmse": (
@@ -155,17 +163,19 @@ class Retrieval:
         }
 
     def save(self, folder: str | Path) -> Path:
-        """Write `retrieval.json`, and every start's outcome as `starts.npz`; both or neither."""
+        """Write `retrieval.json`, every start's outcome as `starts.npz`, and `posterior.npz`; all or nothing."""
         with output_folder(folder, KIND) as scratch:
             write_json(scratch / FILE, self.to_json())
             if self.solutions is not None:  # as it is: random numbers do not compress
                 names = [field.name for field in dataclasses.fields(self.solutions)]
                 write_npz(scratch / STARTS_FILE, {name: getattr(self.solutions, name) for name in names})
+            if self.posterior is not None:
+                self.posterior.save(scratch / POSTERIOR_FILE)
         return Path(folder) / FILE
 
     @classmethod
     def load(cls, path: str | Path) -> "Retrieval":
-        """Read `retrieval.json` or the folder that holds it, with `starts.npz` where that is there.
+        """Read `retrieval.json` or the folder that holds it, with what stands beside it.
 
         Raises:
             InputError: naming the file and the field that is wrong.
@@ -206,6 +216,8 @@ class Retrieval:
                 warnings=tuple(document.get("warnings", ())),
                 notes=tuple(document["notes"]),
                 solutions=_load_starts(file.with_name(STARTS_FILE)),
+                posterior=Posterior.load(file.parent) if file.with_name(POSTERIOR_FILE).is_file() else None,
+                model=Arm.from_json(document["model"]) if document.get("model") else None,
             )
         except InputError:
             raise
@@ -360,7 +372,82 @@ def retrieve(
         warnings=tuple(doubts(phi, names, None if arm is None else reach(arm))),
         notes=tuple(notes),
         solutions=found,
+        posterior=_posterior(table, boxes, constraints, phi, arm),
+        model=table.model or (arm if table.arm in ("", "panda") else None),
     )
+
+
+def _posterior(
+    table: Identification,
+    bounds: Bounds,
+    constraints: tuple[Constraint, ...],
+    phi: Float[np.ndarray, "dof 10"],
+    arm: Arm | None,
+) -> Posterior | None:
+    """What the coefficients tell, friction with them; None where they have no deviations."""
+    if table.std is None or not np.all(table.std > 0):
+        return None
+    told = np.isfinite(table.std)
+    covariance = (
+        np.diag(np.where(told, table.std, 1.0) ** 2) if table.covariance is None else table.covariance
+    )
+    K, mean, names = coefficient_matrix(table.terms, bounds.dof), table.beta, ()
+    own, kinds = np.zeros((bounds.dof, 0)), ()
+    friction = table.friction
+    if table.joint_covariance is not None:
+        covariance = table.joint_covariance
+        if friction is not None:
+            kinds = MODELS[friction.model]
+            names = named(kinds, bounds.dof)
+            own = np.stack([np.asarray(friction.parameters[kind]) for kind in kinds], 1)
+            std = np.stack([np.asarray((friction.std or friction.parameters)[kind]) for kind in kinds], 1)
+            told = np.concatenate([told, np.isfinite(std.ravel())])
+    mean = np.concatenate([mean, own.ravel()])
+    G = np.zeros((len(mean), K.shape[1] + own.size))
+    G[: len(K), : K.shape[1]] = K
+    G[len(K) :, K.shape[1] :] = np.eye(own.size)
+    least = np.array([0.0 if name.split("_")[0] in DISSIPATIVE else -np.inf for name in names])
+    at = np.flatnonzero(told)
+    carried = np.zeros((bounds.dof, 10))
+    if arm is not None and arm.lumped is not None and are_buildable(phi - np.asarray(arm.lumped)):
+        carried = np.asarray(arm.lumped)
+    covariance = covariance[np.ix_(at, at)]
+    return Posterior(
+        told=G[at],
+        mean=mean[at],
+        covariance=covariance,
+        names=names,
+        least=least,
+        bounds=bounds,
+        carried=carried,
+        noise=_noise(table, covariance, at),
+    )
+
+
+def _noise(
+    table: Identification, covariance: Float[np.ndarray, "told told"], told: np.ndarray
+) -> Float[np.ndarray, " dof"]:
+    r"""Of a recording's torque beyond the model, rms [N m]: what the fit left, and what it took from it.
+
+    With any noise of covariance Σ, least squares leave $\mathrm{tr}\,\Sigma$ less what their own estimate varies
+    by: $\mathrm{E}\lVert e\rVert^2 = \mathrm{tr}\,\Sigma - \mathrm{tr}(A^\top A\,C)$.
+    """
+    if table.rmse is None:
+        return np.zeros(table.dof)
+    square = table.rmse**2
+    if (
+        table.evidence is None
+        or table.method != "trajectory"
+        or len(told) != len(table.beta) + (table.evidence.whole.R[:, 0, len(table.beta) : -1].size)
+    ):
+        return np.sqrt(square)
+    whole, rank = table.evidence.whole, len(table.beta)
+    extra = whole.R.shape[2] - 1 - rank
+    for j, R in enumerate(whole.R):
+        at = np.r_[0:rank, rank + j * extra : rank + (j + 1) * extra]
+        A = R[:, :-1]
+        square[j] += np.trace(A.T @ A @ covariance[np.ix_(at, at)]) / whole.samples
+    return np.sqrt(square)
 
 
 def _identified(identification: Identification | Mapping[str, Any] | str | Path) -> Identification:

@@ -19,6 +19,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import scipy.interpolate
 from jaxtyping import Float
 
 from .errors import InputError
@@ -46,6 +47,10 @@ class FourierTrajectory:
     w: float
     """Angular frequency of the first harmonic [rad/s]."""
 
+    @property
+    def dof(self) -> int:
+        return self.a.shape[0]
+
     def __call__(
         self, time: Float[np.ndarray, " time"]
     ) -> tuple[Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"]]:
@@ -54,6 +59,43 @@ class FourierTrajectory:
         s, c = np.sin(time[:, None] * lw), np.cos(time[:, None] * lw)
         q = self.q0 + s @ (self.a / lw).T - c @ (self.b / lw).T
         return q, c @ self.a.T + s @ self.b.T, c @ (self.b * lw).T - s @ (self.a * lw).T
+
+
+@dataclasses.dataclass(frozen=True)
+class SplineTrajectory:
+    """A motion through recorded positions: a spline of the fifth degree, so that accelerations are smooth."""
+
+    spline: Any
+    """Of the positions [rad] over time from 0 [s]."""
+    derivatives: tuple[Any, Any]
+    q0: Float[np.ndarray, " dof"]
+    """[rad]"""
+    w: float
+    """2π over its length [rad/s]."""
+
+    @classmethod
+    def through(
+        cls, time: Float[np.ndarray, " time"], q: Float[np.ndarray, "time dof"]
+    ) -> "SplineTrajectory":
+        """Through positions at increasing times; where these are many, every n-th is enough."""
+        step = max(1, int(0.01 / max(float(np.median(np.diff(time))), 1e-9)))
+        chosen = np.unique(np.append(np.arange(0, len(time), step), len(time) - 1))
+        if len(chosen) < 6:
+            raise InputError(f"a motion of {len(time)} rows is too short to be simulated")
+        spline = scipy.interpolate.make_interp_spline(time[chosen] - time[0], q[chosen], k=5)
+        length = float(time[-1] - time[0])
+        rates = (spline.derivative(1), spline.derivative(2))
+        return cls(spline, rates, q.mean(0), 2 * np.pi / length)
+
+    @property
+    def dof(self) -> int:
+        return len(self.q0)
+
+    def __call__(
+        self, time: Float[np.ndarray, " time"]
+    ) -> tuple[Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"]]:
+        """Position [rad], velocity [rad/s] and acceleration [rad/s²] at `time` [s]."""
+        return self.spline(time), self.derivatives[0](time), self.derivatives[1](time)
 
 
 def fourier_trajectory(a: Any, b: Any, q0: Any, w: float = 0.15 * np.pi) -> FourierTrajectory:
@@ -171,7 +213,7 @@ def panda_sensors() -> Sensors:
 
 def simulate(
     model: str | Path | mujoco.MjModel,
-    trajectory: FourierTrajectory,
+    trajectory: FourierTrajectory | SplineTrajectory,
     *,
     duration: float = 20.0,
     rate: float = 1000.0,
@@ -211,8 +253,8 @@ def simulate(
         InputError: no such arm, or a trajectory for another one.
     """
     compiled = _prepared(model)
-    if compiled.nv != trajectory.a.shape[0]:
-        raise InputError(f"the trajectory moves {trajectory.a.shape[0]} joints; the model has {compiled.nv}")
+    if compiled.nv != trajectory.dof:
+        raise InputError(f"the trajectory moves {trajectory.dof} joints; the model has {compiled.nv}")
     samples = round(duration * rate)
     if samples < 2:
         raise InputError(f"a recording of {duration} s at {rate} Hz has fewer than two samples")
@@ -221,6 +263,14 @@ def simulate(
     time = np.arange(samples) / rate
     q, qd, u = arm.run(time, arm.substeps(1 / rate))
     return _logged(name, time, q, qd, u, sensors or Sensors(), np.random.default_rng(seed))
+
+
+def with_sensors(recording: Recording, sensors: Sensors, seed: int) -> Recording:
+    """A perfect log as these sensors would have shown it; each seed another noise."""
+    if recording.qd is None or recording.tau is None:
+        raise InputError(f"{recording.name}: has no velocity or no torque, so it is no perfect log")
+    random = np.random.default_rng(seed)
+    return _logged(recording.name, recording.time, recording.q, recording.qd, recording.tau, sensors, random)
 
 
 def perturbed(model: str | Path | mujoco.MjModel, seed: int, scale: float = 0.1) -> mujoco.MjModel:
@@ -306,7 +356,7 @@ class _Tracking:
     def __init__(
         self,
         model: mujoco.MjModel,
-        trajectory: FourierTrajectory,
+        trajectory: FourierTrajectory | SplineTrajectory,
         friction: JointFriction,
         bandwidth: float,
     ):

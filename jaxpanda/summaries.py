@@ -416,6 +416,29 @@ def excitation(found: Any) -> Sequence[Section]:
     return [Section("Excitation", [*sentences, *document["notes"]], tables)]
 
 
+def ensemble(found: Any) -> Sequence[Section]:
+    """How members differ, and whether the chains that they were drawn by agree."""
+    document = found.to_json()
+    mixing, total = document["mixing"], document["total_mass"]
+    between = lambda low, middle, high: f"{middle:.4g} ({low:.4g} to {high:.4g})"
+    sentences = [
+        f"{document['count']} members, each of which could be built; {mixing['chains']} chains of "
+        f"{mixing['sweeps']} sweeps, R-hat {mixing['rhat']:.3f} at most, {mixing['effective']:.0f} independent "
+        f"draws at least; {document['seconds']:.1f} s.",
+        f"Total mass {between(*total)} kg. In brackets 5 % and 95 % of the members.",
+    ]
+    rows = [
+        [link["name"], between(*link["mass"]), *(between(*pair) for pair in link["com"])]
+        for link in document["links"]
+    ]
+    kinds = document["friction"]["names"]
+    tables = [Table(["link", "m kg", "cx m", "cy m", "cz m"], rows, "Links: what the recordings leave open")]
+    if kinds:
+        rows = [[joint["name"], *(between(*joint[kind]) for kind in kinds)] for joint in document["joints"]]
+        tables.append(Table(["joint", *kinds], rows, "Friction beyond the model [N m s/rad, N m]"))
+    return [Section("Ensemble", [*sentences, *document["notes"]], tables)]
+
+
 def _told(name: str, numbers: Any, k: int) -> list[str]:
     """A row: a number and its interval, or the range of what it can be."""
     low, high = numbers.interval[k]
@@ -437,5 +460,8 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Conversion": conversion,
     "Excitation": excitation,
     "Fleet": lambda result: result.sections(),
+    "Ensemble": ensemble,
+    "Comparison": lambda found: found.sections(),
+    "Rehearsal": lambda found: found.sections(),
     "Demonstration": lambda result: result.sections,
 }

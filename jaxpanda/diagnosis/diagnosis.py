@@ -28,6 +28,7 @@ from ..export import (
 from ..feasible.nearest import are_buildable, nearest_buildable
 from ..mjcf import MjcfSource, from_document, from_mjcf, with_gravity
 from ..model_file import Model
+from ..posterior import FILE as POSTERIOR_FILE
 from ..recordings import Recording, distinct, load
 from ..session import Say, silent
 from . import knowledge as knowledge_
@@ -40,6 +41,7 @@ from .host import on_host
 from .localise import Localisation, localise, unbiased
 from .meaning import Misread, misread
 from .next_motion import NextMotion, next_motion
+from .posterior import posterior_of
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
 from .resting import AtRest, judge, rests
@@ -78,6 +80,10 @@ class Diagnosis:
     knowledge: knowledge_.Knowledge
     spread: Float[np.ndarray, "standard n"] = dataclasses.field(repr=False)
     """Of the inertial parameters, as `knowledge` has it."""
+    kept: State = dataclasses.field(repr=False)
+    """The terms of the corrected model, by their laws."""
+    scale: float = 1.0
+    """Multiple of the uncertainty that `knowledge` means."""
     sources: tuple[Mapping[str, str], ...] = ()
     """Files that went in: role, name and sha256."""
     replays: tuple[Mapping[str, Any], ...] = ()
@@ -155,14 +161,16 @@ class Diagnosis:
         return [sentence, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
-        """Write diagnosis.json, corrected.xml with what it includes, and corrected.json; next_motion.csv where
-        one would decide. What corrected.xml will not find there comes back, a sentence each.
+        """Write diagnosis.json, corrected.xml with what it includes, corrected.json, and posterior.npz;
+        next_motion.csv where one would decide. What corrected.xml will not find there comes back, a sentence
+        each.
 
         Raises:
             InputError: a file of such a name stands there that no earlier diagnosis left; nothing is written.
         """
         with files.output_folder(folder, KIND) as scratch:
             saved.write(self, scratch)
+            posterior_of(self).save(scratch / POSTERIOR_FILE)
             if self.next_motion is not None:
                 self.next_motion.save(scratch / NEXT_MOTION)
         return missing_assets(self.written, Path(folder))
@@ -275,6 +283,8 @@ def diagnose(
         source=source,
         knowledge=premises.knowledge,
         spread=premises.spread,
+        kept=kept,
+        scale=premises.scale,
     )
 
 

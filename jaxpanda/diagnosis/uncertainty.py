@@ -168,8 +168,22 @@ def _under_noise(design: Design) -> Float[np.ndarray, "n n"]:
     return design.solve(np.swapaxes(half, 0, 1))
 
 
+def joint(design: Design) -> Float[np.ndarray, "n n"]:
+    r"""Covariance of all unknowns of a design, of full rank: the jackknife's, shrunk, and what the prior leaves.
+
+    $\hat x - x = H^{-1}(A^\top e - P x)$, so that to the data's part comes $H^{-1} P H^{-1}$.
+    """
+    prior = design.solve(design.solve(np.diag(design.precision)).T)
+    return statistics.shrunk(design.information, *_blocks(design)) + prior
+
+
 def _by_blocks(design: Design) -> Float[np.ndarray, "n n"]:
     """Covariance of the unknowns by the jackknife over blocks of time."""
+    return statistics.jackknife(design.information, *_blocks(design))
+
+
+def _blocks(design: Design) -> tuple[list[Float[np.ndarray, "n n"]], list[Float[np.ndarray, " n"]]]:
+    """Information and scores of each block of time."""
     blocks = statistics.cut(len(design.residual[0]), statistics.BLOCKS)
     informations = [np.zeros_like(design.information) for _ in blocks]
     scores = [np.zeros_like(design.g) for _ in blocks]
@@ -177,4 +191,4 @@ def _by_blocks(design: Design) -> Float[np.ndarray, "n n"]:
         for b, block in enumerate(blocks):
             informations[b] += A[block].T @ A[block]
             scores[b] += A[block].T @ left[block]
-    return statistics.jackknife(design.information, informations, scores)
+    return informations, scores

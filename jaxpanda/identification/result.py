@@ -53,6 +53,9 @@ class Identification:
     """Of which `std` is the diagonal's root."""
     classical_covariance: Float[np.ndarray, "base base"] | None = None
     """Of which `classical_std` is. Its inverse says how much torque a change of the coefficients moves."""
+    joint_covariance: Float[np.ndarray, "unknowns unknowns"] | None = None
+    """Of the base parameters and, after them, of friction, all of joint 1 first: robust, and of full rank
+    (`statistics.shrunk`), to draw from and to compare by. None where no motion was identified."""
     friction: Friction | None = None
     """Beyond what the arm's model already holds."""
     standard: Float[np.ndarray, "dof 10"] | None = None
@@ -145,6 +148,7 @@ class Identification:
             "classical_covariance": None
             if self.classical_covariance is None
             else self.classical_covariance.tolist(),
+            "joint_covariance": None if self.joint_covariance is None else self.joint_covariance.tolist(),
         }
 
     def save(self, folder: str | Path) -> Path:
@@ -204,6 +208,8 @@ class Identification:
         friction = read.get("friction", None)
         if friction is not None and not isinstance(friction, list):
             raise InputError(f"{where}: friction is no list of one entry a joint")
+        rubs = Friction.from_json(friction, where=f"{where}: friction") if friction else None
+        own = sum(len(values) for values in rubs.parameters.values()) if rubs else 0
         return cls(
             method=method,
             projection=projection,
@@ -217,7 +223,8 @@ class Identification:
             classical_std=_column(rows, "classical_std", where),
             covariance=read.array("covariance", (n, n)),
             classical_covariance=read.array("classical_covariance", (n, n)),
-            friction=Friction.from_json(friction, where=f"{where}: friction") if friction else None,
+            joint_covariance=read.array("joint_covariance", (n + own, n + own)),
+            friction=rubs,
             standard=read.array("standard", (dof, 10)),
             rank=None if (rank := read.number("rank")) is None else int(rank),
             condition_number=read.number("condition_number"),

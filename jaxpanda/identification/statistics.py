@@ -30,12 +30,20 @@ from .regression import UNDETERMINED, Regression
 
 BLOCKS = 20
 """Blocks of the jackknife: a second each in a recording of 20 s."""
+_TOLD = 1e-13
+"""Information that counts, as a share of the largest, unknowns in units of their own."""
+_UNTOLD = 1e14
+"""Variance that stands for no information, in the same units."""
 
 
 def covariances(
     regressions: Sequence[Regression], x: Float[np.ndarray, " unknowns"], sigma: Float[np.ndarray, " dof"]
-) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, "unknowns unknowns"]]:
-    """Covariance of weighted least squares: by the jackknife, and by the textbook."""
+) -> tuple[
+    Float[np.ndarray, "unknowns unknowns"],
+    Float[np.ndarray, "unknowns unknowns"],
+    Float[np.ndarray, "unknowns unknowns"],
+]:
+    """Covariance of weighted least squares: by the jackknife, by the textbook, and `shrunk` between them."""
     weights = 1 / sigma**2
     H = np.zeros((len(x), len(x)))
     informations, scores, total, squares = [], [], 0, 0.0
@@ -53,7 +61,8 @@ def covariances(
     scale = _units(H)
     scaling = np.outer(scale, scale)
     classical = squares / max(total - len(x), 1) * _inverse(H / scaling)
-    return jackknife(H, informations, scores), classical / scaling
+    moves = _moves(H, informations, scores)
+    return _spread(moves) / scaling, classical / scaling, shrunk(H, informations, scores)
 
 
 def jackknife(
@@ -69,12 +78,61 @@ def jackknife(
         scores: $A_b^\\top e_b$ of each block, with the weighted residual of the estimate.
     """
     scale = _units(H)
+    return _spread(_moves(H, informations, scores)) / np.outer(scale, scale)
+
+
+def shrunk(
+    H: Float[np.ndarray, "n n"],
+    informations: Sequence[Float[np.ndarray, "n n"]],
+    scores: Sequence[Float[np.ndarray, " n"]],
+) -> Float[np.ndarray, "n n"]:
+    r"""The jackknife's covariance, drawn towards the shape of $H^{-1}$ as far as its few blocks require.
+
+    B blocks span B - 1 directions of the unknowns: of the others the jackknife says that they are known exactly.
+    Where $H = 1$, with $z_b = \sqrt{B - 1}\,(\Delta_b - \bar\Delta)$ and $S = \sum z_b z_b^\top / B$,
+
+    $$\mathrm{cov} = (1 - \rho)\,S + \rho\,\tfrac{\mathrm{tr} S}{n}\,1, \qquad
+      \rho = \min\Bigl(1, \frac{\sum_b \lVert z_b z_b^\top - S\rVert^2 / B^2}
+                             {\lVert S - \tfrac{\mathrm{tr} S}{n} 1\rVert^2}\Bigr).$$
+
+    It has full rank, so that parameters can be drawn from it and differences of them weighed by it.
+
+    References:
+        Ledoit and Wolf, "A well-conditioned estimator for large-dimensional covariance matrices", J. Multivariate
+        Analysis 2004.
+    """
+    scale = _units(H)
+    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
+    told = values > _TOLD * values[-1]
+    root = vectors[:, told] * np.sqrt(values[told])
+    z = np.sqrt(len(scores) - 1) * _moves(H, informations, scores) @ root
+    count, n = z.shape
+    S = z.T @ z / count
+    mean = np.trace(S) / n
+    own, away = np.sum(z**2, 1), float(np.sum((S - mean * np.eye(n)) ** 2))
+    sampled = float(np.sum(own**2) / count - np.sum(S**2)) / count
+    rho = min(1.0, sampled / away) if away > 0 else 1.0
+    back = vectors[:, told] / np.sqrt(values[told]) / scale[:, None]
+    untold = vectors[:, ~told] / scale[:, None]
+    return back @ ((1 - rho) * S + rho * mean * np.eye(n)) @ back.T + _UNTOLD * untold @ untold.T
+
+
+def _moves(
+    H: Float[np.ndarray, "n n"],
+    informations: Sequence[Float[np.ndarray, "n n"]],
+    scores: Sequence[Float[np.ndarray, " n"]],
+) -> Float[np.ndarray, "blocks n"]:
+    """By how much the unknowns, in `_units`, move without each block, less the mean of that."""
+    scale = _units(H)
     scaling = np.outer(scale, scale)
     moves = np.stack(
         [-_inverse((H - Hb) / scaling) @ (s / scale) for Hb, s in zip(informations, scores, strict=True)]
     )
-    moves -= moves.mean(0)
-    return (len(moves) - 1) / len(moves) * moves.T @ moves / scaling
+    return moves - moves.mean(0)
+
+
+def _spread(moves: Float[np.ndarray, "blocks n"]) -> Float[np.ndarray, "n n"]:
+    return (len(moves) - 1) / len(moves) * moves.T @ moves
 
 
 def _units(H: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
@@ -102,4 +160,4 @@ def cut(samples: int, blocks: int) -> list[slice]:
 def _inverse(H: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Inverse of an information matrix; enormous, but finite, where there is none."""
     values, vectors = np.linalg.eigh(H)
-    return (vectors / np.maximum(values, 1e-14)) @ vectors.T
+    return (vectors / np.maximum(values, 1 / _UNTOLD)) @ vectors.T

@@ -249,7 +249,7 @@ def _result(
 ) -> Identification:
     fit, base, regressions = solved.fit, problem.base, solved.regressions
     beta = fit.x[: base.rank]
-    robust, classical, std, textbook = _uncertainty(problem, solved)
+    robust, classical, joint, std, textbook = _uncertainty(problem, solved)
     e = np.concatenate([r.residual(fit.x) for r in regressions], 1)
     unseen = unseen_percent = None
     if held_out is not None:
@@ -275,6 +275,7 @@ def _result(
         classical_std=textbook[: base.rank],
         covariance=robust[: base.rank, : base.rank],
         classical_covariance=classical[: base.rank, : base.rank],
+        joint_covariance=joint,
         friction=_friction(problem, solved, std, arm.dof),
         standard=fit.phi,
         rank=base.rank,
@@ -300,19 +301,24 @@ def _result(
 def _uncertainty(
     problem: _Problem, solved: _Solved
 ) -> tuple[
-    Float[np.ndarray, "n n"], Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]
+    Float[np.ndarray, "n n"],
+    Float[np.ndarray, "n n"],
+    Float[np.ndarray, "n n"],
+    Float[np.ndarray, " n"],
+    Float[np.ndarray, " n"],
 ]:
-    """Robust and textbook covariance, and the deviations of each; infinite where the data do not tell."""
+    """Robust and textbook covariance, the one between them, and the deviations of the first two; infinite where
+    the data do not tell."""
     regressions, x = solved.regressions, solved.fit.x
     if solved.shape is not None:
         phi1 = x[problem.base.rank :]
         regressions = linearised(problem.rigid, problem.signals, solved.shape, phi1)
         rates = np.stack([phi1, np.zeros_like(phi1), np.zeros_like(phi1)], -1)  # the residual stays as it is
         x = np.concatenate([x[: problem.base.rank], rates.ravel()])
-    robust, classical = covariances(regressions, x, solved.fit.sigma)
+    robust, classical, joint = covariances(regressions, x, solved.fit.sigma)
     known = determined(regressions, solved.fit.sigma)
     std, textbook = (np.where(known, np.sqrt(np.diag(C)), np.inf) for C in (robust, classical))
-    return robust, classical, std, textbook
+    return robust, classical, joint, std, textbook
 
 
 def _friction(problem: _Problem, solved: _Solved, std: Float[np.ndarray, " n"], dof: int) -> Friction | None:
