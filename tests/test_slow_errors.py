@@ -15,7 +15,7 @@ def wandering():
     def off(t, q, qd, qdd):
         rng, out = np.random.default_rng(4), np.zeros_like(q)
         for j in (1, 3):
-            slow = scipy.ndimage.gaussian_filter1d(rng.normal(size=len(t)), 0.4 * len(t) / t[-1])
+            slow = scipy.ndimage.gaussian_filter1d(rng.normal(size=len(t)), 1.0 * len(t) / t[-1])
             out[:, j] = 0.25 * slow / slow.std()
         return out
 

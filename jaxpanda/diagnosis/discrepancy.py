@@ -153,8 +153,8 @@ def slow_errors(
     traces: Sequence[Trace], size: Float[np.ndarray, " dof"]
 ) -> list[Float[np.ndarray, "_time dof _m"]]:
     """Errors of the whole model that change slowly, whatever their cause, of unit variance: `size` [N m] in each
-    joint. No arm is quite its model, and what has no law may not be credited to several that it has none of."""
-    moments = _hats(traces, 0, "moments")
+    joint, none where that is zero. No arm is quite its model, and what has no law is not several laws."""
+    moments = _hats(traces, 0, "moments")[:, : None if np.any(size) else 0]
     columns = [size[j] * moments[:, None, :] * np.eye(len(size))[j][:, None] for j in range(len(size))]
     ends = np.cumsum([t.motion.samples for t in traces])[:-1]
     return np.split(np.concatenate(columns, 2), ends)

@@ -83,7 +83,7 @@ def nuisance(
     arm = traces[0].motion.arm
     damping, level, armature = friction_spread(arm, knowledge, scale)
     out, numbers = [], 0
-    drifts = slow_errors(traces, slow * std) if slow else [np.zeros((*t.motion.q.shape, 0)) for t in traces]
+    drifts = slow_errors(traces, slow * std)
     for trace, off, drift in zip(traces, of_known(traces, std), drifts, strict=True):
         parts = [trace.motion.regressor @ spread]
         joints = np.eye(arm.dof)
@@ -96,7 +96,7 @@ def nuisance(
             parts.append((armature[j] * trace.motion.qdd)[:, :, None] * joints[:, j : j + 1])
         numbers = sum(p.shape[2] for p in parts)
         out.append(np.concatenate([*parts, off, drift, _SHAKEN * trace.shaken], 2))
-    return out, numbers, drifts[0].shape[2]
+    return out, numbers, int(drifts[0].shape[2])
 
 
 def friction_spread(

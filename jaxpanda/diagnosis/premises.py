@@ -32,7 +32,7 @@ _KNOWN: tuple[tuple[knowledge_.Knowledge, float, float], ...] = (
     ("rough", 5.0, -75.0),
 )
 _SLOW = ((1.0, -10.0), (3.0, -15.0), (10.0, -20.0))
-RUNGS = (
+RUNGS: tuple[tuple[knowledge_.Knowledge, float, float, float], ...] = (
     *((k, x, 0.0, p) for k, x, p in _KNOWN),
     *((k, x, slow, p + more) for slow, more in _SLOW for k, x, p in (_KNOWN[0], _KNOWN[1], _KNOWN[3])),
 )
@@ -123,16 +123,16 @@ def settled(
 
 def _price(premises: Premises) -> float:
     """Log prior odds of what is supposed of the model's numbers."""
-    return next((p for *rung, p in RUNGS if rung == _rung(premises)), 0.0)
+    return next((rung[3] for rung in RUNGS if rung[:3] == _rung(premises)), 0.0)
 
 
-def _rung(premises: Premises) -> list:
-    return [premises.knowledge, premises.scale, premises.slow]
+def _rung(premises: Premises) -> tuple[knowledge_.Knowledge, float, float]:
+    return premises.knowledge, premises.scale, premises.slow
 
 
 def _wider(premises: Premises, state: State) -> Premises | None:
     """The supposition under which the recordings are likeliest beside the effects found, if it is a wider one."""
-    at = [i for i, (*rung, _) in enumerate(RUNGS) if rung == _rung(premises)]
+    at = [i for i, rung in enumerate(RUNGS) if rung[:3] == _rung(premises)]
     problem = premises.problem
     best, likeliest = None, state.score + _price(premises)
     for k, x, slow, price in RUNGS[at[0] + 1 :] if at else ():

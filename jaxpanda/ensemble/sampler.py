@@ -404,7 +404,7 @@ def _run(
 
         def once(state, key):
             each = jax.random.split(key, len(whole[1]) + 1)
-            line = lambda state, now: (_line(region, *now, state), None)
+            line = lambda state, now: (_line(region, now[0], now[1], now[2], state), None)
             state = jax.lax.scan(line, state, (*whole, each[1:]))[0]
             return (_beside(beside, each[0], state) if beside.point.shape[1] else state), None
 
