@@ -605,7 +605,9 @@ def _sentence(arguments: list[str], panel: str) -> str:
     name = arguments[0] if arguments else ""
     if name not in commands:
         known = [*commands, "--help", "--version"]
-        what = f"no command {name!r}{_meant(name, known)}" if name else "no command given"
+        if meant := _meant(name, known):
+            return f"no command {name!r}{meant}: see jaxpanda --help"
+        what = f"no command {name!r}" if name else "no command given"
         return f"{what}; there are {', '.join(commands)}: see jaxpanda --help"
     fields = dict(_spelled(commands[name]))
     given = _options(arguments)

@@ -90,7 +90,7 @@ def test_prediction_from_the_saved_folder_reproduces_a_motion_never_seen(found, 
     document = held(tmp_path / "out" / "diagnosis.json")
     assert document["schema"] == "jaxpanda.diagnosis/1"
     assert held(tmp_path / "out" / "corrected.json")["schema"] == "jaxpanda.corrected/1"
-    assert {"corrected.json", "corrected.xml", "diagnosis.json"} == {
+    assert {"corrected.json", "corrected.xml", "diagnosis.json", "posterior.npz"} == {
         p.name for p in (tmp_path / "out").iterdir()
     }
     other = record(7, at_joint(5, stribeck))

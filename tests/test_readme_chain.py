@@ -193,4 +193,4 @@ def test_retrieve_and_export_take_the_arm_that_was_identified(tmp_path, capsys):
 def test_links_of_an_arm_that_is_in_no_file_are_not_put_into_the_panda():
     links = jaxpanda.retrieve({"coefficients": published()["coefficients"]}, starts=16, certificate=False)
     with pytest.raises(InputError, match="--model"):
-        jaxpanda.to_mjcf(dataclasses.replace(links, arm="other"), "never.xml")
+        jaxpanda.to_mjcf(dataclasses.replace(links, arm="other", own=False), "never.xml")

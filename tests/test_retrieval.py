@@ -89,11 +89,15 @@ def test_a_result_is_the_same_after_saving_and_loading(found, tmp_path):
     loaded = Retrieval.load(tmp_path)
     assert loaded.to_json() == found.to_json()
     written = json.loads((tmp_path / "retrieval.json").read_text())
-    assert list(written.pop("run")["files"]) == ["starts.npz"]
+    assert sorted(written.pop("run")["files"]) == ["posterior.npz", "starts.npz"]
     assert written == found.to_json()
     np.testing.assert_array_equal(loaded.standard, found.standard)
     np.testing.assert_array_equal(loaded.solutions.objective, found.solutions.objective)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["retrieval.json", "starts.npz"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "posterior.npz",
+        "retrieval.json",
+        "starts.npz",
+    ]
 
 
 def test_a_result_can_be_pickled(found):

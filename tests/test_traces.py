@@ -85,6 +85,17 @@ def test_a_prediction_keeps_motion_that_is_fast_but_above_the_noise_of_q():
     assert np.sqrt(np.mean(error**2)) < 0.6 * np.std(fast)  # 0.99 with the filter of a diagnosis
 
 
+def test_a_prediction_is_not_shaken_by_rows_that_were_lost():
+    """The low-pass stood at 64 Hz on a real arm: what lost rows do to the spectrum of q looked like motion."""
+    lost = np.random.default_rng(2).random(int(8 * RATE)) < 0.02
+    t = (np.arange(len(lost)) + np.cumsum(lost)) / RATE
+    wave = 0.5 * np.sin(2 * np.pi * 0.3 * t)
+    true = -((2 * np.pi * 0.3) ** 2) * wave
+    qdd = predicted_acceleration(moved(wave))
+    error = (qdd - true[:, None])[100:-100]
+    assert np.sqrt(np.mean(error**2)) < 0.5 * np.std(true)
+
+
 def test_a_prediction_is_not_shaken_by_a_coarse_encoder():
     """Also where each joint stands most of the time, so that its noise is not seen."""
     t = np.arange(int(24 * RATE)) / RATE

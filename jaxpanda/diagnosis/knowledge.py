@@ -83,7 +83,7 @@ def nuisance(
     arm = traces[0].motion.arm
     damping, level, armature = friction_spread(arm, knowledge, scale)
     out, numbers = [], 0
-    drifts = slow_errors(traces, slow * std)
+    drifts = slow_errors(traces, slow * std if slow else np.zeros(arm.dof))
     for trace, off, drift in zip(traces, of_known(traces, std), drifts, strict=True):
         parts = [trace.motion.regressor @ spread]
         joints = np.eye(arm.dof)

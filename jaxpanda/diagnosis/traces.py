@@ -425,7 +425,7 @@ def _clearest_cutoff(
     reach = np.searchsorted(f, f / _WIDER), np.searchsorted(f, f * _WIDER, side="right")
     sums = np.cumsum(np.concatenate([np.zeros((1, q.shape[1])), power]), 0)
     level = (sums[reach[1]] - sums[reach[0]]) / np.maximum(reach[1] - reach[0], 1)[:, None]
-    shaken = np.maximum(shaken, _rising(f, level))
+    shaken = np.maximum(shaken, _rising(f, level, rate))
     moved = np.where(level > (1 + _COUNTS) * shaken, power, 0.0)
     unit = M if noise is None else M / np.maximum(noise, 1e-12)
     cutoffs = np.geomspace(min(_LEAST_WHOLE, 0.25 * rate), 0.25 * rate, _CUTOFFS)
@@ -435,19 +435,17 @@ def _clearest_cutoff(
 
 
 def _rising(
-    f: Float[np.ndarray, " frequencies"], power: Float[np.ndarray, "frequencies dof"]
+    f: Float[np.ndarray, " frequencies"], power: Float[np.ndarray, "frequencies dof"], rate: float
 ) -> Float[np.ndarray, "frequencies dof"]:
-    r"""Noise of $\ddot q$ by the shape of its spectrum: that of a motion falls; where it rises, it is noise's.
+    r"""Noise of $\ddot q$ by the shape of its spectrum: that of a motion falls, and noise rises.
 
-    Above the least power everything is noise, however coloured, as stamps that jitter make it; below it there is
-    what white noise of q would have there.
+    Jitter of stamps rises with $f^2$, white noise of q with $f^4$. As much of the power as would rise with f and
+    exceed it nowhere beyond is noise; a motion of one frequency stands above it.
     """
-    first = int(np.searchsorted(f, _SMOOTH))
-    out = np.zeros_like(power)
-    for j, p in enumerate(power.T):
-        knee = first + int(np.argmin(p[first:]))
-        out[:, j] = np.where(np.arange(len(f)) >= knee, p, p[knee] * (f / f[knee]) ** 4)
-    return out
+    seen = (f > 0) & (f <= _BANDS[-1][0] * rate)
+    slope = np.where(seen[:, None], power, np.inf) / np.maximum(f, f[1])[:, None]
+    least = np.minimum.accumulate(slope[::-1], 0)[::-1]
+    return np.where(np.isfinite(least), least, 0.0) * f[:, None]
 
 
 def _least_step(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
