@@ -105,6 +105,7 @@ def test_a_band_without_the_uncertainty_would_be_too_narrow_or_too_wide(members)
     assert widths[0] < 0.55 * widths[1]
 
 
+@pytest.mark.slow
 def test_hit_and_run_finds_a_uniform_and_a_gaussian():
     """One link of which only the first moment along x is told: the mass is uniform up to its bound."""
     bounds = Bounds(

@@ -136,6 +136,7 @@ CARRIED = np.zeros((2, 10))
 CARRIED[1] = inertia.from_com(jnp.asarray(0.8), jnp.array([0.02, 0.01, 0.05]), 0.004 * jnp.eye(3))
 
 
+@pytest.mark.slow
 def test_what_is_left_of_a_link_is_a_body_in_every_start(loose):
     """Export was refused once the gripper was taken off."""
     found, free = solve(*equations(), WIDE, carried=CARRIED, starts=4), loose
