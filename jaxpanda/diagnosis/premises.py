@@ -136,6 +136,8 @@ def _wider(premises: Premises, state: State) -> Premises | None:
     problem = premises.problem
     best, likeliest = None, state.score + _price(premises)
     for k, x, slow, price in RUNGS[at[0] + 1 :] if at else ():
+        if slow > _larger(premises.slow if best is None else best.slow):
+            continue  # smaller slow errors have made the recordings no likelier
         other = pose(
             problem.traces,
             problem.active,
@@ -152,6 +154,11 @@ def _wider(premises: Premises, state: State) -> Premises | None:
     if best is None:
         return None
     return dataclasses.replace(best, notes=(*premises.notes, *_told(premises, best)))
+
+
+def _larger(slow: float) -> float:
+    """The next larger slow errors that are supposed."""
+    return min((more for more, _ in _SLOW if more > slow), default=slow)
 
 
 def _told(premises: Premises, wider: Premises) -> list[str]:
