@@ -21,6 +21,7 @@ def test_the_demo_finds_the_virtual_arm_and_leaves_its_files(tmp_path):
         "held_out.csv",
         "identification.json",
         "identification.npz",
+        "posterior.npz",
         "retrieval.json",
         "starts.npz",
         "panda.xml",

@@ -241,9 +241,9 @@ def diagnose(
     kept = transferable(problem, laws)
     lost = [all(t is not k for k in kept.terms) for t in laws.terms]
     found = tuple(findings(problem, state, laws, lost))
-    wrong = numbers(problem, state, premises.changes)
-    if all(active):  # healthy recordings show wrong numbers as well
-        found = (*found, *wrong)
+    contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
+    wrong = numbers(problem, state, premises.changes) if contradicted else []
+    found = (*found, *wrong)
     corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
     corrected = _buildable(source, corrected, problem)
     corrected = turning_as(in_question, corrected, problem.noise(()).std)
@@ -258,9 +258,7 @@ def diagnose(
     # numbers that only moved within what they were uncertain by stay as the user wrote them
     written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
-    answer = verdict(
-        found, fitted, partly(problem, state) or _errs_slowly(problem, state) or not all(_judged(problem))
-    )
+    answer = verdict(found, fitted, partly(problem, state) or not all(_judged(problem)))
     return Diagnosis(
         verdict=answer,
         findings=tuple(calibrated(found, answer, fitted.noise_floor)),
@@ -329,13 +327,6 @@ def _turned(problem: Problem, state: State) -> list[str]:
         f"the model's friction at joint{'s' * (len(joints) > 1)} {', '.join(joints)} turns over another range of"
         " speeds than MuJoCo's constraint does, which is no finding (solreffriction and solimpfriction set it)"
     ]
-
-
-def _errs_slowly(problem: Problem, state: State) -> bool:
-    """Whether slow errors, which no law explains, exceed the noise of some joint."""
-    at = problem.slow_errors
-    torque = np.concatenate([N[:, :, at] @ state.design.x[at] for N in problem.nuisance])
-    return bool(np.any(np.mean(torque**2, 0) > state.noise.std**2))
 
 
 def _turning(corrected: Corrected) -> list[str]:

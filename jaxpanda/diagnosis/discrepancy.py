@@ -149,17 +149,6 @@ def of_known(
     return np.split(np.concatenate(parts, 2), np.cumsum(samples)[:-1])
 
 
-def slow_errors(
-    traces: Sequence[Trace], size: Float[np.ndarray, " dof"]
-) -> list[Float[np.ndarray, "_time dof _m"]]:
-    """Errors of the whole model that change slowly, whatever their cause, of unit variance: `size` [N m] in each
-    joint, none where that is zero. No arm is quite its model, and what has no law is not several laws."""
-    moments = _hats(traces, 0, "moments")[:, : None if np.any(size) else 0]
-    columns = [size[j] * moments[:, None, :] * np.eye(len(size))[j][:, None] for j in range(len(size))]
-    ends = np.cumsum([t.motion.samples for t in traces])[:-1]
-    return np.split(np.concatenate(columns, 2), ends)
-
-
 def _hats(traces: Sequence[Trace], joint: int, channel: str) -> Float[np.ndarray, "rows n"]:
     if channel == "moments":
         parts = [hats(t.motion.time, max(3, round(np.ptp(t.motion.time) / _PERIOD))) for t in traces]

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ..arm import Arm
 from ..errors import InputError
 from ..parameters import random_regressor
-from .discrepancy import of_known, slow_errors
+from .discrepancy import of_known
 from .traces import Trace
 
 Knowledge = Literal["exact", "identified", "rough", "unknown"]
@@ -74,17 +74,14 @@ def nuisance(
     knowledge: Knowledge,
     std: Float[np.ndarray, " dof"],
     scale: float = 1.0,
-    slow: float = 0.0,
-) -> tuple[list[Float[np.ndarray, "_time dof _n"]], int, int]:
-    """The columns N of each recording, how many of them, the first ones, are numbers of the model, and how many
-    are slow errors of `slow` times the noise. Between those is what the model's friction may be off, and noise of
-    the encoders ends them; no knowledge takes these away. `std`: of the noise [N m]; `scale` multiplies the
-    uncertainty of friction and rotors where it is "rough"."""
+) -> tuple[list[Float[np.ndarray, "_time dof _n"]], int]:
+    """The columns N of each recording, and how many of them are numbers of the model; the others are what its
+    friction may be off and noise of the encoders, which no knowledge takes away. `std`: of the noise [N m];
+    `scale` multiplies the uncertainty of friction and rotors where it is "rough"."""
     arm = traces[0].motion.arm
     damping, level, armature = friction_spread(arm, knowledge, scale)
     out, numbers = [], 0
-    drifts = slow_errors(traces, slow * std if slow else np.zeros(arm.dof))
-    for trace, off, drift in zip(traces, of_known(traces, std), drifts, strict=True):
+    for trace, off in zip(traces, of_known(traces, std), strict=True):
         parts = [trace.motion.regressor @ spread]
         joints = np.eye(arm.dof)
         for j in np.flatnonzero(damping > 0):
@@ -95,8 +92,8 @@ def nuisance(
         for j in np.flatnonzero(armature > 0):
             parts.append((armature[j] * trace.motion.qdd)[:, :, None] * joints[:, j : j + 1])
         numbers = sum(p.shape[2] for p in parts)
-        out.append(np.concatenate([*parts, off, drift, _SHAKEN * trace.shaken], 2))
-    return out, numbers, int(drifts[0].shape[2])
+        out.append(np.concatenate([*parts, off, _SHAKEN * trace.shaken], 2))
+    return out, numbers
 
 
 def friction_spread(

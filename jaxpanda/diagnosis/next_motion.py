@@ -256,7 +256,7 @@ def _pair_sums(problem: Problem, noise: Noise, pair: _Pair) -> tuple[_Sums, _Sum
     """What a leaves for b to imitate, and the other way round."""
     base = []
     for r, of_one in enumerate(problem.nuisance):
-        columns = np.delete(of_one, slice(problem.known_off.start, problem.slow_errors.stop), axis=2)
+        columns = np.delete(of_one, problem.known_off, axis=2)
         held = [_wide(problem, _Shapes((t.effect,)), r)[:, :, 0] for t in pair.others]
         base.append(np.concatenate([columns, *held], 2))
     A = [problem.whitened([c[:, j] for c in base], noise, j) for j in range(problem.dof)]

@@ -24,20 +24,14 @@ from .search import search
 from .state import State, gains, in_noise, likelier
 from .traces import Trace
 
-_KNOWN: tuple[tuple[knowledge_.Knowledge, float, float], ...] = (
+RUNGS: tuple[tuple[knowledge_.Knowledge, float, float], ...] = (
     ("identified", 1.0, 0.0),
     ("identified", 8.0, -5.0),
     ("identified", 20.0, -15.0),
     ("rough", 1.0, -50.0),
     ("rough", 5.0, -75.0),
 )
-_SLOW = ((1.0, -10.0), (3.0, -15.0), (10.0, -20.0))
-RUNGS: tuple[tuple[knowledge_.Knowledge, float, float, float], ...] = (
-    *((k, x, 0.0, p) for k, x, p in _KNOWN),
-    *((k, x, slow, p + more) for slow, more in _SLOW for k, x, p in (_KNOWN[0], _KNOWN[1], _KNOWN[3])),
-)
-"""How well the inertial parameters may be known, the multiple of that uncertainty, slow errors of the model over
-the noise, and the log prior odds."""
+"""How well the inertial parameters may be known, the multiple of that uncertainty, and the log prior odds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +44,6 @@ class Premises:
     knowledge: knowledge_.Knowledge
     scale: float = 1.0
     """Multiple of the uncertainty that `knowledge` means."""
-    slow: float = 0.0
-    """Slow errors of the whole model, over the noise."""
     background: tuple[Term, ...] = ()
     """What the healthy recordings show; its columns, each times its deviation, end the nuisance."""
     notes: tuple[str, ...] = ()
@@ -69,18 +61,16 @@ def pose(
     saturated: Saturation | None = None,
     scale: float = 1.0,
     catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE,
-    slow: float = 0.0,
 ) -> Premises:
-    """The problem of these recordings under what is known; `scale` multiplies the uncertainty of the inertias,
-    `slow` the noise, where the model may have slow errors."""
+    """The problem of these recordings under what is known; `scale` multiplies the uncertainty of the inertias."""
     arm = traces[0].motion.arm
     nothing = tuple(t.motion.q[:, :, None][:, :, :0] for t in traces)
     empty = Problem(traces, active, nothing, saturated=saturated)
     std = empty.noise(()).std
     spread = scale * knowledge_.inertial_spread(arm, knowledge, std)
-    columns, numbers, drifts = knowledge_.nuisance(traces, spread, knowledge, std, scale, slow)
-    problem = posed(traces, active, columns, background, empty.saturation, numbers, catalogue, drifts)
-    return Premises(problem, spread, knowledge, scale, slow, problem.background)
+    columns, numbers = knowledge_.nuisance(traces, spread, knowledge, std, scale)
+    problem = posed(traces, active, columns, background, empty.saturation, numbers, catalogue)
+    return Premises(problem, spread, knowledge, scale, problem.background)
 
 
 def settled(
@@ -90,7 +80,6 @@ def settled(
     log: list[str],
     scale: float = 1.0,
     catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE,
-    slow: float = 0.0,
 ) -> tuple[Premises, State]:
     """Effects found under premises that the recordings do not contradict."""
     background: tuple[Term, ...] = ()
@@ -98,18 +87,15 @@ def settled(
     healthy = tuple(t for t, on in zip(traces, active, strict=True) if not on)
     if healthy:
         log.append("healthy recordings alone")
-        premises, state = settled(healthy, (True,) * len(healthy), knowledge, log, scale, catalogue, slow)
-        knowledge, scale, slow, notes = premises.knowledge, premises.scale, premises.slow, premises.notes
+        premises, state = settled(healthy, (True,) * len(healthy), knowledge, log, scale, catalogue)
+        knowledge, scale, notes = premises.knowledge, premises.scale, premises.notes
         background = tuple(t.law for t in state.terms if not t.effect.bound_to_recording)
         log.append("suspect recordings beside them")
-    premises = pose(traces, active, knowledge, background, scale=scale, catalogue=catalogue, slow=slow)
+    premises = pose(traces, active, knowledge, background, scale=scale, catalogue=catalogue)
     premises = dataclasses.replace(premises, notes=notes)
     state = search(premises.problem, log)
     while (wider := _wider(premises, state)) is not None:
-        log.append(
-            f"the model's numbers as {wider.knowledge!r}, {wider.scale:g} times, with slow errors of"
-            f" {wider.slow:g} noises: searched again"
-        )
+        log.append(f"the model's numbers as {wider.knowledge!r}, {wider.scale:g} times: searched again")
         other = search(wider.problem, log)
         gained = (
             likelier((premises.problem, state), (wider.problem, other)) + _price(wider) - _price(premises)
@@ -123,56 +109,26 @@ def settled(
 
 def _price(premises: Premises) -> float:
     """Log prior odds of what is supposed of the model's numbers."""
-    return next((rung[3] for rung in RUNGS if rung[:3] == _rung(premises)), 0.0)
-
-
-def _rung(premises: Premises) -> tuple[knowledge_.Knowledge, float, float]:
-    return premises.knowledge, premises.scale, premises.slow
+    return next((p for k, x, p in RUNGS if (k, x) == (premises.knowledge, premises.scale)), 0.0)
 
 
 def _wider(premises: Premises, state: State) -> Premises | None:
     """The supposition under which the recordings are likeliest beside the effects found, if it is a wider one."""
-    at = [i for i, rung in enumerate(RUNGS) if rung[:3] == _rung(premises)]
+    at = [i for i, (k, x, _) in enumerate(RUNGS) if (k, x) == (premises.knowledge, premises.scale)]
     problem = premises.problem
     best, likeliest = None, state.score + _price(premises)
-    for k, x, slow, price in RUNGS[at[0] + 1 :] if at else ():
-        if slow > _larger(premises.slow if best is None else best.slow):
-            continue  # smaller slow errors have made the recordings no likelier
+    for k, x, price in RUNGS[at[0] + 1 :] if at else ():
         other = pose(
-            problem.traces,
-            problem.active,
-            k,
-            premises.background,
-            problem.saturation,
-            x,
-            problem.catalogue,
-            slow,
+            problem.traces, problem.active, k, premises.background, problem.saturation, x, problem.catalogue
         )
         value = _needed(other.problem, state).score + price
         if value > likeliest:
             best, likeliest = other, value
     if best is None:
         return None
-    return dataclasses.replace(best, notes=(*premises.notes, *_told(premises, best)))
-
-
-def _larger(slow: float) -> float:
-    """The next larger slow errors that are supposed."""
-    return min((more for more, _ in _SLOW if more > slow), default=slow)
-
-
-def _told(premises: Premises, wider: Premises) -> list[str]:
-    """What is supposed of the model now, in sentences."""
-    out = []
-    if (wider.knowledge, wider.scale) != (premises.knowledge, premises.scale):
-        told = f"{wider.knowledge!r}" + (f", {wider.scale:g} times" if wider.scale != 1 else "")
-        note = f"the recordings contradict that the model's numbers are known as {premises.knowledge!r}"
-        out.append(f"{note}: they were taken as {told}")
-    if wider.slow != premises.slow:
-        out.append(
-            f"the model was taken to have slow errors without a law, of about {wider.slow:g} times the noise"
-        )
-    return out
+    told = f"{best.knowledge!r}" + (f", {best.scale:g} times" if best.scale != 1 else "")
+    note = f"the recordings contradict that the model's numbers are known as {premises.knowledge!r}"
+    return dataclasses.replace(best, notes=(*premises.notes, f"{note}: they were taken as {told}"))
 
 
 def _needed(problem: Problem, state: State) -> State:

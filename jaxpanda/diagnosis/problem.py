@@ -92,8 +92,6 @@ class Problem:
     """That of the same recordings, where a problem posed otherwise has made it already."""
     catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE
     """Effects that are tried."""
-    slow: int = 0
-    """How many columns of the nuisance are slow errors of the whole model."""
     _lock: threading.Lock = dataclasses.field(
         default_factory=threading.Lock, init=False, repr=False, compare=False
     )
@@ -151,21 +149,15 @@ class Problem:
     @property
     def known_off(self) -> slice:
         """Where the nuisance has what the known friction may be off."""
-        stop = self.slow_errors.start
+        stop = self.shaken.start
         return slice(stop if self.numbers is None else self.numbers, stop)
-
-    @property
-    def slow_errors(self) -> slice:
-        """Where the nuisance has slow errors of the whole model."""
-        return slice(self.shaken.start - self.slow, self.shaken.start)
 
     def explained(self, x: Float[np.ndarray, " n"], terms: Sequence[Term] = ()) -> Float[np.ndarray, " laws"]:
         """Of a design's coefficients those of the nuisance and of the terms' laws, what belongs to a recording
         and to no model set to zero: the encoders' noise, and what laws are off."""
         count = self.nuisance[0].shape[2]
         nuisance = x[:count].copy()
-        for at in (self.known_off, self.slow_errors, self.shaken):
-            nuisance[at] = 0.0
+        nuisance[self.shaken], nuisance[self.known_off] = 0.0, 0.0
         ends = count + np.cumsum([0, *(t.width for t in terms)])
         laws = [x[at : at + len(t.deviation)] for at, t in zip(ends, terms, strict=False)]
         return np.concatenate([nuisance, *laws])
@@ -516,7 +508,6 @@ def posed(
     saturated: Saturation | None = None,
     numbers: int | None = None,
     catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE,
-    slow: int = 0,
 ) -> Problem:
     """A problem whose background acts in all recordings: its columns, by their deviations, end the nuisance."""
     everywhere = Problem(traces, (True,) * len(traces), tuple(nuisance))
@@ -524,4 +515,4 @@ def posed(
     wide = [
         np.concatenate([n, *(t.columns[r] * t.deviation for t in terms)], 2) for r, n in enumerate(nuisance)
     ]
-    return Problem(traces, active, tuple(wide), terms, numbers, saturated, catalogue, slow)
+    return Problem(traces, active, tuple(wide), terms, numbers, saturated, catalogue)
