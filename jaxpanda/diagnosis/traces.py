@@ -188,7 +188,11 @@ def prepare(
     """
     rough = signals_.prepare(recording, cutoff=3.0, rate=WORK_RATE, trim=0.0 if whole else TRIM)
     rate, time = rough.rate, rough.time
-    position = _positions(recording.time, recording.q, time, rate)
+    if whole:
+        position = _positions(recording.time, recording.q, time, rate)
+    else:  # samples beside a gap do not count
+        spline = scipy.interpolate.CubicSpline(recording.time, recording.q)
+        position = spline(np.clip(time, *recording.time[[0, -1]]))
     if noise is None and rough.tau is not None:
         noise = signals_.white_noise(rough.tau)
     if whole:
