@@ -188,11 +188,10 @@ def prepare(
     """
     rough = signals_.prepare(recording, cutoff=3.0, rate=WORK_RATE, trim=0.0 if whole else TRIM)
     rate, time = rough.rate, rough.time
-    if whole:
-        position = _positions(recording.time, recording.q, time, rate)
-    else:  # samples beside a gap do not count
-        spline = scipy.interpolate.CubicSpline(recording.time, recording.q)
-        position = spline(np.clip(time, *recording.time[[0, -1]]))
+    spline = scipy.interpolate.CubicSpline(recording.time, recording.q)
+    position = spline(np.clip(time, *recording.time[[0, -1]]))
+    if whole:  # elsewhere samples beside a gap do not count
+        position = _across_gaps(position, recording.time, recording.q, time, rate)
     if noise is None and rough.tau is not None:
         noise = signals_.white_noise(rough.tau)
     if whole:
@@ -269,15 +268,16 @@ def _stuck(
     return tuple(out)
 
 
-def _positions(
+def _across_gaps(
+    position: Float[np.ndarray, "time dof"],
     rows: Float[np.ndarray, " rows"],
     q: Float[np.ndarray, "rows dof"],
     time: Float[np.ndarray, " time"],
     rate: float,
 ) -> Float[np.ndarray, "time dof"]:
-    """q at the times of the grid: a spline through all rows; across a gap, where that would multiply the noise
-    by the gap's length in rows, the cubic that meets parabolas fitted to the rows on either side."""
-    out = scipy.interpolate.CubicSpline(rows, q)(np.clip(time, *rows[[0, -1]]))
+    """`position`, the spline through all rows, with the cubic that meets parabolas fitted to the rows on either
+    side across a gap: there a spline multiplies the noise by the gap's length in rows."""
+    out = position.copy()
     gaps = np.flatnonzero(np.diff(rows) > _GAP / rate)
     runs = np.concatenate([[0], gaps + 1, [len(rows)]])
     reach = max(_LEAST_BESIDE, round(_BESIDE_GAP * rate))
