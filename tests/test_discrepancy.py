@@ -14,7 +14,7 @@ from jaxpanda.diagnosis.evidence import Design, Noise
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.proposals import grids
 from jaxpanda.diagnosis.search import posterior, search
-from jaxpanda.diagnosis.state import State, gains, in_noise, places, start, with_terms, without
+from jaxpanda.diagnosis.state import State, evidence, gains, in_noise, places, start, with_terms, without
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import CATALOGUE, neighbours
 from jaxpanda.effects.drive import Armature, JointSpring, TorqueRipple
@@ -240,8 +240,12 @@ def test_a_gain_is_what_the_model_loses_without_the_term_and_its_discrepancy(dam
     for i in range(2):
         others = [t for k, t in enumerate(both.terms) if k != i]
         less = in_noise(damped, others, state.noise)
-        lost = both.score - less.score
-        assert gains(both)[i] == pytest.approx(lost, rel=1e-6, abs=1e-6)
+        lost = (
+            evidence(damped, both.terms, both.design, both.noise)
+            - evidence(damped, others, less.design, less.noise)
+            + both.terms[i].prior
+        )
+        assert gains(damped, both)[i] == pytest.approx(lost, rel=1e-6, abs=1e-6)
         assert without(both, i).log_evidence == pytest.approx(less.design.log_evidence, rel=1e-9)
 
 

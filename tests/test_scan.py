@@ -1,5 +1,7 @@
 """What makes a diagnosis fast changes none of its answers."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -62,10 +64,11 @@ def test_the_low_pass_by_products_is_the_recursive_one(problem: Problem):
     assert np.max(np.abs(trace.down(x) - expected)) < 1e-9
 
 
-def test_the_scan_gives_each_shape_the_evidence_that_it_has_alone(problem: Problem):
+@pytest.mark.parametrize("slow", [None, np.tile([0.98, 0.7], (7, 1))])
+def test_the_scan_gives_each_shape_the_evidence_that_it_has_alone(problem: Problem, slow):
     coulomb = CoulombFriction(3, 0.01)
     terms = (problem.term(coulomb, np.array([0.3])),)
-    noise = problem.noise(terms)
+    noise = dataclasses.replace(problem.noise(terms), slow=slow)
     design = problem.design(terms, noise)
     scanned = problem.scan(design, noise)
     groups = {(g.name, g.joint): g for g in (*problem.library, *problem.catchalls)}
@@ -103,4 +106,4 @@ def test_a_term_defends_its_place_with_its_own_shape(problem: Problem):
     state = search.with_terms(problem, [problem.term(TorqueRipple(3, 33.7, "one"), np.array([1.0, 1.0]))])
     found = search.instead(problem, state, 0)
     (gained,) = [gained for gained, terms in found if terms == state.terms]
-    assert gained == pytest.approx(search.gains(state)[0])
+    assert gained == pytest.approx(search.gains(problem, state)[0])

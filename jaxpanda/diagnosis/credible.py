@@ -1,5 +1,6 @@
 """Whether a proposal is what it calls itself, beyond having evidence."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,6 +11,7 @@ from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem
 from .shapes import clock, projection
+from .state import left_over
 
 _GIVEN = 0.2
 AFRESH = 0.1
@@ -79,12 +81,16 @@ def is_of_time(problem: Problem, design: Design, noise: Noise, proposal: Proposa
     if not any(shifts):
         return True
     c, _ = fitted(problem, design, noise, proposal)
+    noise = dataclasses.replace(noise, slow=None)  # how a repeat differs is all of it, however slow
     told = apart = beyond = 0.0
     for j in effect.joints if isinstance(effect, AbstractJointEffect) else range(problem.dof):
         whitened = lambda one, j=j: problem.whitened([x[:, j] for x in problem.full_columns(one)], noise, j)
-        law = np.column_stack([np.zeros((len(design.left[j]), 0)), *map(whitened, effect.steady)])
+        law = np.column_stack([np.zeros((problem.rows[-1].stop, 0)), *map(whitened, effect.steady)])
         own = whitened(effect) @ c
-        differ, alike = _between_repeats(problem, j, shifts, np.column_stack([design.left[j], own, law]))
+        (left,) = left_over(problem, noise, design.terms, design.x, [j])
+        differ, alike = _between_repeats(
+            problem, j, shifts, np.column_stack([np.concatenate(left), own, law])
+        )
         left, own = differ.T[:2]
         told += 0.25 * float(left @ left - (left - own) @ (left - own))
         apart += 0.25 * float(own @ own)

@@ -22,6 +22,8 @@ _WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135)
 _EDGE = 3
 _SPOTS, _PLACES = (0.03, 0.08), 64
 """Widths of a torque at one place [rad], and how many places are tried at most."""
+_SOME = 1e-3
+"""Share of a window's power that nothing in the model explains, where it is told at all."""
 _SLOWEST = 5.0
 """Least order of a ripple [1/rad]."""
 
@@ -128,7 +130,19 @@ def _likeliest(
 
 
 def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal]:
-    """For each link and recording the likeliest window of a contact, and the likeliest change of payload."""
+    """For each link and recording the likeliest window of a contact, and the likeliest change of payload.
+
+    Beside slow errors a window tells by its edges, and one whose edges are a little off tells next to nothing:
+    there those of a scan that knows of no slow errors are given too.
+    """
+    yield from _windows(problem, design, noise)
+    if any(noise.has_slow(j) for j in range(problem.dof)):
+        plain = dataclasses.replace(noise, slow=None)
+        yield from _windows(problem, problem.design(design.terms, plain), plain)
+
+
+def _windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal]:
+    """By one scan."""
     first = np.cumsum([0, *(t.motion.samples for t in problem.traces)])
     for r, (trace, on) in enumerate(zip(problem.traces, problem.active, strict=True)):
         if not on:
@@ -157,6 +171,8 @@ def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal
             range(problem.dof),
         )
         b, G, H, C = (_cumulated(np.sum([p[k] for p in parts], 0)) for k in range(4))
+        power = np.array([np.trace(p[1].sum((0, 1))) for p in parts])
+        passed = power @ np.stack([_passed(noise, j, bins, count) for j in range(problem.dof)]) / power.sum()
         if design.factor is not None:
             flat = np.swapaxes(C, 0, 1).reshape(C.shape[1], -1)
             flat = scipy.linalg.solve_triangular(design.factor[0], flat, lower=True, check_finite=False)
@@ -164,7 +180,7 @@ def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal
         n = 6 * problem.dof  # of the contacts; the rest is the payload
         if len(pairs):
             found = [
-                _window_sums((b[:, k], G[:, i], C[:, :, k]), pairs)
+                _window_sums((b[:, k], G[:, i], C[:, :, k]), pairs, passed)
                 for i, k in enumerate(np.arange(n).reshape(-1, 6))
             ]
             yield from _events(contact, found, stops, pairs)
@@ -173,7 +189,7 @@ def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal
         lost = np.stack([np.zeros_like(switches), switches], 1)
         for form, spans in (("gained", gained), ("lost", lost), ("carried", pairs)):
             if len(spans):
-                sums = _window_sums((b[:, n:], H, C[:, :, n:]), spans)
+                sums = _window_sums((b[:, n:], H, C[:, :, n:]), spans, passed)
                 yield from _events([dataclasses.replace(change, form=form)], [sums], stops, spans)
 
 
@@ -199,12 +215,12 @@ def _binned(
         return np.concatenate([x, np.zeros((-len(x) % bins, *x.shape[1:]))]).reshape(-1, bins, *x.shape[1:])
 
     def with_model(A: np.ndarray, F: np.ndarray) -> np.ndarray:
-        return np.swapaxes(split(A[rows]), 1, 2) @ F
+        return np.swapaxes(split(_turned_back(noise, joint, A[rows])), 1, 2) @ F
 
     if ("windows", r) not in here.blocks:
         contacts = trace.motion.wrench_columns[:, :, joint].reshape(trace.motion.samples, -1)
-        F = noise.whiten(np.concatenate([contacts, payload.over(trace.motion)[:, joint]], 1), joint)
-        F = split(F * problem.weights(noise, r, joint)[:, None])
+        columns = np.concatenate([contacts, payload.over(trace.motion)[:, joint]], 1)
+        F = split(noise.innovations(columns, joint) * problem.weights(noise, r, joint)[:, None])
         apart = F[:, :, : contacts.shape[1]].reshape(*F.shape[:2], -1, 6).swapaxes(1, 2)
         whole = F[:, :, contacts.shape[1] :]
         grams = apart.swapaxes(2, 3) @ apart, whole.swapaxes(1, 2) @ whole
@@ -220,13 +236,42 @@ def _binned(
                 kept[id(term)] = with_model(A, F)
             C[:, place : place + width] = kept[id(term)]
         place += width
-    b = np.einsum("ts,tsk->tk", split(design.left[joint][rows]), F)
+    left = _turned_back(noise, joint, design.left[joint][rows])
+    b = np.einsum("ts,tsk->tk", split(left), F)
     return b, *kept["grams"], C
 
 
-def _window_sums(sums, pairs):
+def _window_sums(sums, pairs, passed):
+    """b and G in windows; `passed`, of the power of a window of so many bins, is that of a constant force: where
+    one that changes passes more, all of it counts."""
     b, G, C = (x[pairs[:, 1]] - x[pairs[:, 0]] for x in sums)
-    return b, G - np.matmul(np.swapaxes(C, 1, 2), C)
+    explained = np.matmul(np.swapaxes(C, 1, 2), C)
+    left = G * passed[pairs[:, 1] - pairs[:, 0], None, None] - explained
+    if passed.min() < 1:
+        unit = 1 / np.sqrt(np.maximum(np.diagonal(G, axis1=1, axis2=2), 1e-300))
+        least = np.linalg.eigvalsh(unit[:, :, None] * left * unit[:, None, :])[:, 0]
+        left = np.where((least < _SOME)[:, None, None], G - explained, left)
+    return b, left
+
+
+def _turned_back(
+    noise: Noise, joint: int, x: Float[np.ndarray, "_time ..."]
+) -> Float[np.ndarray, "_time ..."]:
+    r"""$L^\top x$ with L what makes slow errors level, but for where it begins."""
+    if not noise.has_slow(joint):
+        return x
+    return noise.levelled(x[::-1], joint, np.zeros((1, *x.shape[1:])))[0][::-1]
+
+
+def _passed(noise: Noise, joint: int, bins: int, count: int) -> Float[np.ndarray, " edges"]:
+    """Of a force that is constant through so many bins, the share of its power that slow errors leave."""
+    if not noise.has_slow(joint):
+        return np.ones(count + 1)
+    lasts = np.arange(1, count + 1) * bins
+    step, _ = noise.levelled(np.ones(2 * count * bins), joint, np.zeros(1))
+    within = np.cumsum(step**2)[lasts - 1]  # of a force that ends, the same again with its sign
+    tails = [np.sum((step[n : n + count * bins] - step[: count * bins]) ** 2) for n in lasts]
+    return np.append(1.0, (within + tails) / lasts)
 
 
 def _events(effects, found, clock, pairs) -> Iterator[Proposal]:

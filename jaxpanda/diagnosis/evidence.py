@@ -19,13 +19,16 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+import scipy.signal
 import scipy.special
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 SCALES = (1.0, 4.0, 16.0)
 """Sizes of an effect over the noise, per sample, that are expected alike."""
 PHYSICAL_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Sizes over the physically plausible one, where a coefficient has such."""
+BEGINS = 8
+"""Rows that tell what a stretch begins with."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,13 +41,60 @@ class Noise:
     """Of the noise itself [N m]."""
     trust: Float[np.ndarray, "rows dof"] | None = None
     """What a sample weighs beside what laws may be off there, 0 to 1; None where there are no laws."""
+    slow: Float[np.ndarray, "dof 2"] | None = None
+    """Pole p and zero z of a slow error beside the noise: what is white is $(1 - p L) / (1 - z L)$ of the
+    innovations, with L the step back; as good as none where they are equal."""
+    least: Float[np.ndarray, " dof"] | None = None
+    """Deviation of the innovations where nothing is left unexplained; `sigma` may be larger [N m]."""
+    dt: float = 0.01
+    """Between samples [s]."""
 
     def trusted(self, rows: slice, joint: int) -> Float[np.ndarray, " _rows"] | float:
         """Weights of some rows, all recordings one below the other."""
         return 1.0 if self.trust is None else self.trust[rows, joint]
 
-    def whiten(self, x: Float[np.ndarray, "_time ..."], joint: int) -> Float[np.ndarray, "_time ..."]:
-        """x with unit, uncorrelated noise; the first rows are zero."""
+    def whiten(
+        self, x: Float[np.ndarray, "_time ..."], joint: int, weights: Float[np.ndarray, " _time"]
+    ) -> Float[np.ndarray, "_time ..."]:
+        """x, by what each row weighs, with unit, uncorrelated noise; the first rows are zero."""
+        wide = weights.reshape(-1, *[1] * (x.ndim - 1))
+        foretold = np.arange(len(x)) >= self.a.shape[1]
+        return self.level(self.innovations(x, joint) * wide, joint, (weights > 0) & foretold)
+
+    def level(
+        self, y: Float[np.ndarray, "_time ..."], joint: int, counts: Bool[np.ndarray, " _time"]
+    ) -> Float[np.ndarray, "_time ..."]:
+        """Innovations, in which slow errors weigh as much as any; zero where they do not count, beyond which
+        each stretch is taken by itself."""
+        if not self.has_slow(joint):
+            return y
+        out = np.zeros_like(y)
+        for rows in stretches(counts):
+            past = self.before(y[rows], joint)
+            out[rows], _ = self.levelled(y[rows], joint, past)
+        return out
+
+    def before(self, y: Float[np.ndarray, "_time ..."], joint: int) -> Float[np.ndarray, "1 ..."]:
+        """State of the filter where a stretch begins, as if as much of what it begins with as is likely to be a
+        slow error had lasted: nothing tells that an error was none before."""
+        p, z = self.slow[joint]  # pyright: ignore
+        variance = (p - z) ** 2 / (1 - p**2)  # of the slow error, beside white noise of unit variance
+        likely = variance / (variance + 1 / min(len(y), BEGINS))
+        return -likely * (p - z) / (1 - z) * y[:BEGINS].mean(0, keepdims=True)
+
+    def levelled(
+        self, y: Float[np.ndarray, "_time ..."], joint: int, past: Float[np.ndarray, "1 ..."]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`level` of a stretch, or of a part of it, and the filter's state behind it."""
+        p, z = self.slow[joint]  # pyright: ignore
+        return scipy.signal.lfilter([1.0, -p], [1.0, -z], y, axis=0, zi=past)
+
+    def has_slow(self, joint: int) -> bool:
+        """Whether there is an error slower than the noise in a joint."""
+        return self.slow is not None and bool(self.slow[joint, 0] != self.slow[joint, 1])
+
+    def innovations(self, x: Float[np.ndarray, "_time ..."], joint: int) -> Float[np.ndarray, "_time ..."]:
+        """x less what the noise's past foretells of it; the first rows are zero."""
         a = self.a[joint]
         y = np.zeros_like(x)
         order = len(a)
@@ -53,6 +103,12 @@ class Noise:
             y[order:] -= a[k] * x[order - 1 - k : len(x) - 1 - k]
         y /= self.sigma[joint]
         return y
+
+
+def stretches(counts: Bool[np.ndarray, " rows"]) -> list[slice]:
+    """Where rows count, one after the other."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], counts, [False]])))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 class OnDemand(Sequence):

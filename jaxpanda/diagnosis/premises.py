@@ -136,7 +136,7 @@ def _needed(problem: Problem, state: State) -> State:
     terms = list(state.terms)
     while True:
         whole = in_noise(problem, terms, state.noise)
-        gained = gains(whole)
+        gained = gains(problem, whole)
         if not terms or min(gained) > 0:
             return whole
         del terms[int(np.argmin(gained))]

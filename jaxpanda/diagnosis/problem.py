@@ -239,8 +239,7 @@ class Problem:
         """Rows of a joint in all recordings, one below the other, with unit noise."""
         parts = []
         for r, x in enumerate(columns):
-            w = self.weights(noise, r, joint).reshape(-1, *[1] * (x.ndim - 1))
-            parts.append(noise.whiten(x, joint) * w)
+            parts.append(noise.whiten(x, joint, self.weights(noise, r, joint)))
         return np.concatenate(parts)
 
     def weights(self, noise: Noise, r: int, joint: int) -> Float[np.ndarray, " _time"]:
@@ -279,18 +278,22 @@ class Problem:
         return self._scanned[2]
 
     @functools.cached_property
-    def _joints(self) -> dict[int, Whitened]:
+    def _joints(self) -> dict[tuple[int, bool], Whitened]:
+        """By joint, and whether its noise is more than what a saturated model leaves."""
         return {}
 
     def whitened_joint(self, noise: Noise, joint: int, terms: Sequence[Term] = ()) -> Whitened:
         """Residual, nuisance and terms in a joint, whitened; kept while the joint's noise stays."""
         trust = None if noise.trust is None else noise.trust[:, joint].tobytes()
-        stamp = noise.a[joint].tobytes(), float(noise.sigma[joint]), trust
-        here = self._joints.get(joint)
+        slow = noise.slow[joint].tobytes() if noise.has_slow(joint) else None  # pyright: ignore
+        stamp = noise.a[joint].tobytes(), float(noise.sigma[joint]), trust, slow
+        widened = slow is not None or (noise.least is not None and noise.sigma[joint] != noise.least[joint])
+        key = joint, bool(widened)
+        here = self._joints.get(key)
         if here is None or here.stamp != stamp:
             residual = self.whitened([r[:, joint] for r in self.residual], noise, joint)
             nuisance = self.whitened([n[:, joint] for n in self.nuisance], noise, joint)
-            here = self._joints[joint] = Whitened(stamp, residual, nuisance)
+            here = self._joints[key] = Whitened(stamp, residual, nuisance)
         for term in terms:
             if id(term) not in here.terms:
                 acts = any(np.any(c[:, joint]) for c in term.columns)
@@ -429,9 +432,9 @@ class Problem:
         return Saturation(self.traces)
 
     @functools.cached_property
-    def noise_scale(self) -> Float[np.ndarray, " dof"]:
-        """How many times each joint's noise in the last model was a saturated one's; the next begins so."""
-        return np.ones(self.dof)
+    def beyond_noise(self) -> list[tuple]:
+        """What is beyond each joint's noise beside the last model; the next begins so too."""
+        return []
 
     @functools.cached_property
     def _noises(self) -> dict[tuple, tuple]:
@@ -469,7 +472,7 @@ class Problem:
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         off = self._known_unresolved + sum(t.unresolved for t in terms if t.unresolved is not None)
         trust = 1 / np.sqrt(1 + off / np.square(std))
-        return Noise(np.stack(a), np.array(sigma), np.array(std), trust)
+        return Noise(np.stack(a), np.array(sigma), np.array(std), trust, dt=self.traces[0].motion.dt)
 
     @functools.cached_property
     def _known_unresolved(self) -> Float[np.ndarray, "rows dof"]:

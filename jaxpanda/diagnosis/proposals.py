@@ -53,7 +53,7 @@ def ranked(
     if events and likeliest > _AHEAD * max(0.0, *(p.evidence for p in events)):
         kept += events
     elif len(where) > 1 or joints is None or before:
-        scanned += windows(problem, design, noise)
+        scanned += [_weighed(problem, design, noise, p) for p in windows(problem, design, noise)]
     many = _places(problem)
     held = Counter(t.effect.name for t in design.terms)
     best: dict[tuple, Proposal] = {}
@@ -72,6 +72,13 @@ def ranked(
     refined = parallel(lambda p: refine(problem, design, noise, p), first)
     found = [p for p in (*refined, *rest) if is_credible(problem, design, noise, p)]
     return sorted(found, key=lambda p: -p.evidence)
+
+
+def _weighed(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> Proposal:
+    """A window with its own evidence: that of the scan is what its columns would have without slow errors."""
+    best, deviation = evidence_of(problem, design, noise, proposal.effect)
+    gained = best - proposal.best
+    return dataclasses.replace(proposal, best=best, deviation=deviation, evidence=proposal.evidence + gained)
 
 
 def by_place(proposals: Sequence[Proposal]) -> dict[int | None, list[Proposal]]:

@@ -16,7 +16,7 @@ import scipy.linalg
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
-from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
+from .evidence import BEGINS, PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes, stretches
 from .host import parallel
 from .library import Candidates
 from .traces import Trace
@@ -32,20 +32,26 @@ def whitened_slices(
     x: Float[np.ndarray, "rows n"], traces: Sequence[Trace], noise: Noise, joint: int
 ) -> Iterator[tuple[slice, Float[np.ndarray, "_some n"]]]:
     """`Problem.whitened`, a few rows at a time; rows that are zero for want of a past are left out."""
-    a, order = noise.a[joint], noise.a.shape[1]
-    step = max(8, _SLICE // max(1, x.shape[1]))
+    a, order, slow = noise.a[joint], noise.a.shape[1], noise.has_slow(joint)
+    step = max(BEGINS, _SLICE // max(1, x.shape[1]))
     start = 0
     for trace in traces:
         stop = start + trace.motion.samples
         weight = trace.weights[:, joint] * noise.trusted(slice(start, stop), joint) / noise.sigma[joint]
-        for low in range(start + order, stop, step):
-            high = min(low + step, stop)
-            y = a[0] * x[low - 1 : high - 1]
-            for k in range(1, order):
-                y += a[k] * x[low - 1 - k : high - 1 - k]
-            np.subtract(x[low:high], y, out=y)
-            y *= weight[low - start : high - start, None]
-            yield slice(low, high), y
+        parts = stretches(weight[order:] > 0) if slow else [slice(0, stop - start - order)]
+        for part in parts:
+            past = None
+            for low in range(start + order + part.start, start + order + part.stop, step):
+                high = min(low + step, start + order + part.stop)
+                y = a[0] * x[low - 1 : high - 1]
+                for k in range(1, order):
+                    y += a[k] * x[low - 1 - k : high - 1 - k]
+                np.subtract(x[low:high], y, out=y)
+                y *= weight[low - start : high - start, None]
+                if slow:
+                    past = noise.before(y, joint) if past is None else past
+                    y, past = noise.levelled(y, joint, past)
+                yield slice(low, high), y
         start = stop
 
 

@@ -20,6 +20,7 @@ from .proposals import by_place, grids, plainer, ranked, with_prior
 from .shapes import evidence_of, first_steps, refine
 from .state import (
     State,
+    evidence,
     gains,
     in_noise,
     likelier,
@@ -39,6 +40,8 @@ TEMPERATURE = 3.0
 quite what it is taken for, and counts as evidence what is none."""
 BETTER = 1.0
 """By how much a model must be likelier to be worth a step [nats]."""
+UNLIKELY = -10.0
+"""Evidence of a proposal from which it is weighed in the noise that it would leave [nats]."""
 _NEGATIVE = 2.0
 """Standard deviations by which a coefficient may be negative that cannot be."""
 _TRIED = 5
@@ -111,15 +114,17 @@ def choices(
     """What the foremost proposals bring with their discrepancies, beside these terms; the likeliest first."""
     if not proposals:
         return []
-    own = design.log_evidence
-    some = [p for p in proposals if p.evidence > _WINDOW * max(proposals[0].evidence, 0.0)][:_TRIED]
+    own = evidence(problem, terms, design, noise)
+    best = proposals[0].evidence
+    some = [p for p in proposals if p.evidence > (_WINDOW * best if best > 0 else UNLIKELY)][:_TRIED]
     out = []
     for p in some:
         for form in (p, *plainer(problem, design, noise, p)):
             term = taken(problem, design, noise, form)
             more = problem.design((*terms, term), noise)
             if is_possible(term, more):
-                out.append((more.log_evidence - own + term.prior, (term,)))
+                found = evidence(problem, (*terms, term), more, noise)
+                out.append((found - own + term.prior, (term,)))
             problem.forget(term)
     return sorted(out, key=lambda choice: -choice[0])
 
@@ -139,7 +144,7 @@ def grow(problem: Problem, state: State, say: Any, free: bool = True) -> State:
     while len(state.terms) < _MOST:
         proposals = ranked(problem, state.design, state.noise, joints, proposals)
         say(f"{len(state.terms)} terms: " + describe(proposals[:6]))
-        new = [p for p in _new(state.terms, proposals, free) if p.evidence > 0]
+        new = [p for p in _new(state.terms, proposals, free) if p.evidence > UNLIKELY]
         added = foremost(problem, state, new)
         if not added:
             return state
@@ -171,7 +176,7 @@ def foremost(problem: Problem, state: State, proposals: Sequence[Proposal]) -> l
 def prune(problem: Problem, state: State, say: Any) -> State:
     """Drop terms that the others have made needless, the weakest first."""
     while state.terms:
-        gained = gains(state)
+        gained = gains(problem, state)
         weakest = int(np.argmin(gained))
         if gained[weakest] >= 0:
             break
@@ -185,7 +190,7 @@ def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> Sta
     for i in range(len(state.terms)):
         if not _is_new(problem, ("exchange", free), state, (i,)):
             continue
-        own, best = gains(state)[i], instead(problem, state, i, free)[0]
+        own, best = gains(problem, state)[i], instead(problem, state, i, free)[0]
         if best[0] > own + BETTER:
             if [t.key for t in best[1]] != [state.terms[i].key]:
                 said = ", ".join(map(name, best[1]))
@@ -219,7 +224,11 @@ def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
                 continue
             others = tuple(t for i, t in enumerate(state.terms) if i not in group)
             design = problem.design(others, state.noise)
-            own = state.design.log_evidence - design.log_evidence + sum(state.terms[i].prior for i in group)
+            own = (
+                evidence(problem, state.terms, state.design, state.noise)
+                - evidence(problem, others, design, state.noise)
+                + sum(state.terms[i].prior for i in group)
+            )
             joints = None
             if all(isinstance(state.terms[i].effect, AbstractJointEffect) for i in group):
                 joints = {j for i in group for j in state.terms[i].effect.joints}
@@ -257,7 +266,11 @@ def instead(problem: Problem, state: State, i: int, free: bool = True) -> list[C
         found += [
             pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts, free))
         ]
-    own = state.design.log_evidence - rest.log_evidence + term.prior
+    own = (
+        evidence(problem, state.terms, state.design, state.noise)
+        - evidence(problem, others, rest, state.noise)
+        + term.prior
+    )
     return sorted([(own, (term,)), *found], key=lambda choice: -choice[0])
 
 

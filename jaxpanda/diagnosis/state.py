@@ -55,18 +55,93 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
 
     What the model leaves of a joint beyond the noise is noise as well until something explains it: the variance
     is not known, and a law is worth $\tfrac n2 \log$ of what it reduces it by. Else many laws would be called on
-    to explain together what none of them is.
+    to explain together what none of them is. The same of what is slower than the noise, as errors of a model are:
+    of that there are few independent samples, however many were recorded.
     """
     noise = problem.noise(terms)
-    scaled = lambda scale: in_noise(problem, terms, dataclasses.replace(noise, sigma=noise.sigma * scale))
-    scale = problem.noise_scale.copy()
-    state = scaled(scale)
-    beyond = mean_squares(state) * scale**2
-    found = _STEP ** np.floor(np.log(np.maximum(beyond, 1.0)) / (2 * np.log(_STEP)))
-    if np.all(found == scale):
-        return state
-    problem.noise_scale[:] = found
-    return scaled(found)
+
+    def beside(beyond: Sequence[Beyond]) -> State:
+        wider = dataclasses.replace(
+            noise,
+            sigma=noise.sigma * [b.scale for b in beyond],
+            slow=np.array([b.slow for b in beyond]),
+            least=noise.sigma,
+        )
+        return in_noise(problem, terms, wider)
+
+    # what a fit leaves depends on the noise it was made in: that of the last model, and none that is unexplained
+    starts = (*problem.beyond_noise, (Beyond(),) * problem.dof)
+    x = [beside(start).design.x for start in starts]
+    left = [[beyond(noise, j, y) for j, y in enumerate(left_over(problem, noise, terms, c))] for c in x]
+    least = tuple(min(of_joint, key=lambda b: b.left) for of_joint in zip(*left, strict=True))
+    problem.beyond_noise[:] = [least]
+    return beside(least)
+
+
+def left_over(
+    problem: Problem,
+    noise: Noise,
+    terms: Sequence[Term],
+    x: Float[np.ndarray, " n"],
+    joints: Sequence[int] | None = None,
+) -> list[list[Float[np.ndarray, " _time"]]]:
+    """Innovations, in some noise, of what a model leaves of each of these joints in each recording; zero where a
+    row does not count."""
+    out = []
+    for j in range(problem.dof) if joints is None else joints:
+        parts = zip(
+            problem.residual,
+            problem.nuisance,
+            *(t.at_joint(j) for t in terms),
+            strict=True,
+        )
+        of_joint = []
+        for r, (residual, nuisance, *columns) in enumerate(parts):
+            left = residual[:, j] - np.concatenate([nuisance[:, j], *columns], 1) @ x
+            of_joint.append(noise.innovations(left, j) * problem.weights(noise, r, j))
+        out.append(of_joint)
+    return out
+
+
+@dataclasses.dataclass(frozen=True)
+class Beyond:
+    """What of a joint's innovations is beyond those that a saturated model leaves."""
+
+    scale: float = 1.0
+    """How many times those they are, in steps."""
+    slow: tuple[float, float] = (0.0, 0.0)
+    """Pole and zero of the slow error beside which they are smallest."""
+    left: float = 0.0
+    """Twice the nats that a sample of them costs beside that."""
+
+
+def beyond(noise: Noise, joint: int, left: Sequence[Float[np.ndarray, " _time"]]) -> Beyond:
+    """The slow error, if what is left is beyond the noise, with which a joint's innovations are smallest; its two
+    numbers must be worth it (Schwarz 1978)."""
+    best, shape = float(np.log(max(_mean_square(np.concatenate(left)), 1e-300))), (0.0, 0.0)
+    count = max(sum(map(np.count_nonzero, left)), 2)
+    for tried in slow_errors(noise.dt) if best > 0 else ():
+        wider = dataclasses.replace(noise, slow=np.tile(tried, (len(noise.sigma), 1)))
+        levelled = [wider.level(part, joint, part != 0) for part in left]
+        found = float(np.log(_mean_square(np.concatenate(levelled)))) + 2 * np.log(count) / count
+        if found < best:
+            best, shape = found, tried
+    scale = _STEP ** np.floor(max(best, 0.0) / (2 * np.log(_STEP)))
+    return Beyond(scale, shape, 1 + best if best > 0 else float(np.exp(best)))
+
+
+@functools.cache
+def slow_errors(dt: float) -> tuple[tuple[float, float], ...]:
+    """Poles and zeros of slow errors that are told apart: how long they last, and how many times the noise they
+    are where they are largest."""
+    out = []
+    for lasts in _LASTING:
+        pole = float(np.exp(-dt / lasts))
+        times = _LARGER
+        while (zero := 1 - times * (1 - pole)) >= 0:
+            out.append((pole, zero))
+            times *= _LARGER
+    return tuple(out)
 
 
 def in_noise(problem: Problem, terms: Sequence[Term], noise: Noise) -> State:
@@ -86,10 +161,34 @@ def without(state: State, i: int) -> Design:
     return state.design.without(i)
 
 
-def gains(state: State) -> list[float]:
+def gains(problem: Problem, state: State) -> list[float]:
     """By how much each term makes the model likelier, beside the others [nats]."""
-    own = state.design.log_evidence
-    return [own - without(state, i).log_evidence + t.prior for i, t in enumerate(state.terms)]
+    own = evidence(problem, state.terms, state.design, state.noise)
+    rest = [(*state.terms[:i], *state.terms[i + 1 :]) for i in range(len(state.terms))]
+    return [
+        own - evidence(problem, others, without(state, i), state.noise) + t.prior
+        for i, (t, others) in enumerate(zip(state.terms, rest, strict=True))
+    ]
+
+
+def evidence(problem: Problem, terms: Sequence[Term], design: Design, noise: Noise) -> float:
+    r"""Log evidence of a model that was fitted in the noise beside another.
+
+    Where a joint has errors beyond the saturated model's noise their size is not known, and falls with what is
+    explained: there $-\tfrac12 \sum e^2$ gives way to $-\tfrac n2 \log s^2$ in the noise that is left.
+    """
+    if noise.least is None:
+        return design.log_evidence
+    plain = dataclasses.replace(noise, sigma=noise.least, slow=None)
+    uneven = [j for j in range(problem.dof) if noise.has_slow(j) or noise.sigma[j] > noise.least[j]]
+    gained = 0.0
+    for j, parts in zip(uneven, left_over(problem, plain, terms, design.x, uneven), strict=True):
+        count = sum(map(np.count_nonzero, parts))
+        as_is = np.concatenate([noise.level(part, j, part != 0) for part in parts])
+        as_is *= plain.sigma[j] / noise.sigma[j]
+        wider = np.log(noise.sigma[j] / plain.sigma[j])
+        gained += 0.5 * float(as_is @ as_is) + count * (wider - 0.5 * beyond(plain, j, parts).left)
+    return design.log_evidence + gained
 
 
 def likelier(a: tuple[Problem, State], b: tuple[Problem, State]) -> float:
@@ -121,16 +220,21 @@ def independent(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
 def leftover(problem: Problem, state: State) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
     """Mean square of each joint's whitened residual beyond a saturated model's noise, before the terms and after
     them."""
-    design, beyond = state.design, np.square(state.noise.sigma / problem.noise(state.terms).sigma)
+    design = state.design
     kept = np.arange(len(design.precision)) < len(design.precision) - sum(t.width for t in state.terms)
     bare = Design([A[:, kept] for A in design.columns], design.residual, design.precision[kept])
-    before, after = (beyond * [_mean_square(e) for e in d.left] - 1 for d in (bare, design))
+    before, after = (
+        mean_squares(problem, problem.noise(state.terms), terms, d.x) - 1
+        for terms, d in (((), bare), (state.terms, design))
+    )
     return before, after
 
 
-def mean_squares(state: State) -> Float[np.ndarray, " dof"]:
-    """Of what is left of each joint's residual, whitened: 1 where it is noise."""
-    return np.array([_mean_square(left) for left in state.design.left])
+def mean_squares(
+    problem: Problem, noise: Noise, terms: Sequence[Term], x: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " dof"]:
+    """Of what a model leaves of each joint, whitened by a saturated model's noise: 1 where it is noise."""
+    return np.array([_mean_square(np.concatenate(left)) for left in left_over(problem, noise, terms, x)])
 
 
 def _mean_square(left: Float[np.ndarray, " rows"]) -> float:
@@ -146,5 +250,7 @@ def overlaps(state: State) -> list[tuple[int, int]]:
 
 
 _TOGETHER = 0.02
+_LASTING, _LARGER = (0.5, 2.0), 2.0
+"""Of slow errors: how long they last [s], and between their sizes that are told apart."""
 _STEP = 1.1
 """Between the deviations of a joint's noise that are told apart: others' columns are whitened again for each."""

@@ -58,7 +58,9 @@ def standing_off(problem: Problem, state: State) -> Finding | None:
     weight = np.maximum(np.mean(weights**2, 0), 1e-9)
     beyond = np.mean((left / noise * weights) ** 2, 0) / weight
     # what is slow, as friction that holds a joint at rest somewhere, is beyond noise only if its changes are
-    beyond = np.minimum(beyond, mean_squares(state) * problem.noise_scale**2)
+    beyond = np.minimum(
+        beyond, mean_squares(problem, problem.noise(state.terms), state.terms, state.design.x)
+    )
     joint = int(np.argmax(beyond))
     if beyond[joint] < BEYOND:
         return None

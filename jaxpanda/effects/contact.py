@@ -29,7 +29,7 @@ class ExternalContact(AbstractArmEffect):
 
     name: ClassVar[str] = "external_contact"
     family: ClassVar[str] = "contact"
-    prior: ClassVar[float] = -45.0
+    prior: ClassVar[float] = -17.0
     shapes: ClassVar[tuple[Shape, ...]] = (
         Shape("start", "s", -np.inf, np.inf, False),
         Shape("stop", "s", -np.inf, np.inf, False),

@@ -78,7 +78,7 @@ class JointSpring(AbstractInstantEffect):
     name: ClassVar[str] = "joint_spring"
     family: ClassVar[str] = "load"
     seen_against: ClassVar[str] = "position"
-    prior: ClassVar[float] = -28.0
+    prior: ClassVar[float] = -17.0
     reveals: ClassVar[str] = "the joint's full range at rest, in different poses of the arm"
 
     joint: Joint
@@ -245,7 +245,7 @@ class JointElasticity(AbstractArmEffect):
     name: ClassVar[str] = "joint_elasticity"
     family: ClassVar[str] = "drive"
     seen_against: ClassVar[str] = "load"
-    prior: ClassVar[float] = -40.0
+    prior: ClassVar[float] = -24.0
     discrepancy: ClassVar[float] = 0.15
     varies_with: ClassVar[tuple[str, ...]] = ("moments",)
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "position"

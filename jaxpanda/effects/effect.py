@@ -81,7 +81,7 @@ class AbstractEffect(eqx.Module):
     """The motion that shows the effect, and tells it from what it is confounded with."""
     seen_against: ClassVar[str] = "time"
     """What its torque is drawn against."""
-    prior: ClassVar[float] = -25.0
+    prior: ClassVar[float] = -15.0
     """Logarithm of the odds, beforehand, that it is somewhere where it is not in the model."""
     discrepancy: ClassVar[float] = 0.02
     """Share by which the torque of such physics differs from the law of this class, as a standard deviation."""

@@ -25,7 +25,7 @@ from .motion import Channels, Joint
 _WIDTH = Shape("v0", "rad/s", 1e-3, 0.3)
 
 
-COMMON = -15.0
+COMMON = -9.0
 """Prior of friction that every gear has."""
 CORRECTED = -10.0
 """Prior of a number of the user's model that is wrong: many are round, and nobody measured them."""
@@ -127,7 +127,7 @@ class PowerLawFriction(AbstractDryFriction):
     seen_against: ClassVar[str] = "velocity"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("exponent", "1", 0.35, 3.0),)
     reveals: ClassVar[str] = ViscousFriction.reveals
-    prior: ClassVar[float] = -28.0
+    prior: ClassVar[float] = -17.0
 
     joint: Joint
     exponent: Float[Array, ""] | float
@@ -172,7 +172,7 @@ class AsymmetricFriction(AbstractDryFriction):
     dissipates: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
     reveals: ClassVar[str] = "rests of 0.3 s and more, and motion in both directions"
-    prior: ClassVar[float] = -28.0
+    prior: ClassVar[float] = -17.0
 
     joint: Joint
     v0: Float[Array, ""] | float
@@ -281,7 +281,7 @@ class LoadDependentFriction(AbstractDryFriction):
     seen_against: ClassVar[str] = "|load|, turned by direction"
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH, Shape("exponent", "1", 0.6, 1.6))
     reveals: ClassVar[str] = "the same speed in loaded and unloaded poses; with and without payload"
-    prior: ClassVar[float] = -28.0
+    prior: ClassVar[float] = -17.0
 
     joint: Joint
     v0: Float[Array, ""] | float
@@ -369,7 +369,7 @@ class FrictionDrift(AbstractDryFriction):
     seen_against: ClassVar[str] = "time, turned by direction"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0), _WIDTH)
     reveals: ClassVar[str] = "the same motion cold and warm"
-    prior: ClassVar[float] = -28.0
+    prior: ClassVar[float] = -17.0
     drifts: ClassVar[bool] = True
 
     joint: Joint

@@ -171,7 +171,7 @@ class PayloadChange(AbstractArmEffect):
 
     name: ClassVar[str] = "payload_change"
     family: ClassVar[str] = "load"
-    prior: ClassVar[float] = -28.0
+    prior: ClassVar[float] = -17.0
     reveals: ClassVar[str] = "the same poses before and after"
     bound_to_recording: ClassVar[bool] = True
     repeats: ClassVar[bool] = True

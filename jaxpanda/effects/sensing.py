@@ -22,6 +22,7 @@ class TorqueOffset(AbstractInstantEffect):
     name: ClassVar[str] = "torque_offset"
     family: ClassVar[str] = "sensor"
     reveals: ClassVar[str] = "rests, and poses on both sides of the joint's zero of gravity"
+    prior: ClassVar[float] = -9.0
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
@@ -96,7 +97,7 @@ class TorqueDrift(AbstractInstantEffect):
 
     name: ClassVar[str] = "torque_drift"
     family: ClassVar[str] = "sensor"
-    prior: ClassVar[float] = -28.0
+    prior: ClassVar[float] = -17.0
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0),)
     reveals: ClassVar[str] = "the same poses early and late"
     drifts: ClassVar[bool] = True
@@ -265,7 +266,7 @@ class TimeDelay(AbstractArmEffect):
 
     name: ClassVar[str] = "time_delay"
     family: ClassVar[str] = "clock"
-    prior: ClassVar[float] = -45.0
+    prior: ClassVar[float] = -27.0
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "s", 1e-4, 0.2, pivot=True),)
     reveals: ClassVar[str] = "fast reversals"
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"

@@ -43,7 +43,7 @@ class StribeckFriction(AbstractDryFriction):
         Shape("v0", "rad/s", 1e-3, 0.05),
     )
     reveals: ClassVar[str] = "slow ramps through zero velocity, in several poses"
-    prior: ClassVar[float] = -28.0
+    prior: ClassVar[float] = -17.0
 
     joint: Joint
     stribeck_velocity: Float[Array, ""] | float

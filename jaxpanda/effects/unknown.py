@@ -20,7 +20,7 @@ from .effect import (
 )
 from .motion import Channels, Joint
 
-FREE = -35.0
+FREE = -21.0
 """Prior of a torque that has no law."""
 SIGN_WIDTH = 0.01
 """Velocity over which friction without a law changes sign [rad/s]."""
