@@ -4,7 +4,7 @@
     JAX_PLATFORMS=cpu python experiments/speed/gpu.py --tiny --out tiny.json      # a rehearsal on a processor
 
 Parts are processes of their own, so that one that fails or runs out of memory leaves the others. They compile
-together and measure in turn; figures are written after each. The last two need MuJoCo and mujoco-mjx.
+a few at a time and measure in turn; figures are written after each. The last two need MuJoCo and mujoco-mjx.
 
 - derivatives: `kernels/benchmarks/derivatives.py --gpu`, float32 and float64, beside the floor of copying;
 - rnea: `kernels/benchmarks/rnea.py`, inverse dynamics and regressor, on the same card;
@@ -241,22 +241,19 @@ def main() -> None:
         if args.tiny:
             options |= {"limit": 5, "steps_of_gradient": 10}
         parts: dict[str, tuple[list[str], dict[str, str]]] = {}
+        if engine:
+            parts["ensemble"] = [__file__, "--out", str(args.out), "--ensemble", json.dumps(options)], {}
+        else:
+            result["not measured"] = "ensemble, mjx: mujoco and mujoco-mjx are not installed"
+        derivatives = [str(BENCHMARKS / "derivatives.py"), "--gpu", "--rounds", rounds]
         for name, own in (("", {}), (", fused multiply-adds", {"XLA_FLAGS": FUSED})):
             rnea = ["--batch", str(batch), "--rounds", rounds, "--child", "0", folder]
             parts["rnea" + name] = [str(BENCHMARKS / "rnea.py"), *rnea], own
             for kind in ("float32", "float64"):
-                more = ["--gpu", "--batch", str(batch // 2 | 1), "--rounds", rounds, "--dtypes", kind]
-                groups = ["--groups", *(["3"] if args.tiny or name else ["3", "2", "1"])]
-                parts[f"derivatives {kind}{name}"] = (
-                    [str(BENCHMARKS / "derivatives.py"), *more, *groups],
-                    own,
-                )
-        if engine:
-            parts["ensemble"] = [__file__, "--out", str(args.out), "--ensemble", json.dumps(options)], {}
-            peer = [str(BENCHMARKS / "derivatives.py"), "--gpu", "--groups", "--mjx", "--rounds", rounds]
-            parts["mjx"] = peer, {}
-        else:
-            result["not measured"] = "ensemble, mjx: mujoco and mujoco-mjx are not installed"
+                more = ["--batch", str(batch // 2 | 1), "--dtypes", kind]
+                parts[f"derivatives {kind}{name}"] = [*derivatives, *more], own
+            if engine and not name:
+                parts["mjx"] = [*derivatives, "--groups", "--mjx"], {}
 
         def measured(name: str) -> dict:
             command, own = parts[name]
@@ -268,8 +265,9 @@ def main() -> None:
             return found if figures is None else found | {"figures": figures}
 
         chosen = [name for name in parts if not args.only or name.startswith(tuple(args.only))]
-        # The compiler takes most of the time, on the host: parts go together, and wait for each other to measure.
-        with ThreadPoolExecutor(1 if args.tiny else max(1, (os.cpu_count() or 1) // 2)) as pool:
+        # The compiler takes most of the time, on the host: parts go together and measure in turn. Their arrays
+        # must all find room: three parts hold up to 60 GiB; ten ran out of the 80 of an H100.
+        with ThreadPoolExecutor(1 if args.tiny else 3) as pool:
             waiting = {pool.submit(measured, name): name for name in chosen}
             for done in as_completed(waiting):
                 result["parts"][waiting[done]] = found = done.result()

@@ -337,9 +337,7 @@ def main() -> None:
     parser.add_argument(
         "--gpu", action="store_true", help="measure JAX's default device in place of the processor"
     )
-    parser.add_argument(
-        "--groups", type=int, nargs="*", default=[3, 2, 1], help="on a GPU: numbers of programs"
-    )
+    parser.add_argument("--groups", type=int, nargs="*", default=[3], help="on a GPU: numbers of programs")
     parser.add_argument(
         "--dtypes", nargs="+", default=["float32", "float64"], help="on a GPU: of what to take"
     )
