@@ -1,13 +1,14 @@
-"""On a GPU, in one command and six minutes: derivatives, RNEA and regressor, ensembles in MJX.
+"""On a GPU, in one command: derivatives, RNEA and regressor, ensembles in MJX.
 
     python experiments/speed/gpu.py --out figures.json
     JAX_PLATFORMS=cpu python experiments/speed/gpu.py --tiny --out tiny.json      # a rehearsal on a processor
 
-Each part is a process of its own with a limit, so that one that fails or runs out of memory leaves the others;
-figures are written after each. MuJoCo and mujoco-mjx are needed by the last two parts alone.
+Parts are processes of their own, so that one that fails or runs out of memory leaves the others. They compile
+a few at a time and measure in turn; figures are written after each. The last two need MuJoCo and mujoco-mjx.
 
 - derivatives: `kernels/benchmarks/derivatives.py --gpu`, float32 and float64, beside the floor of copying;
 - rnea: `kernels/benchmarks/rnea.py`, inverse dynamics and regressor, on the same card;
+- both once more where the compiler may fuse a product and a sum;
 - ensemble: arms whose masses, centres of mass and inertias differ from the Panda's by up to a tenth, rolled out
   for ten seconds in one program of MJX's public functions; and the gradient of their tracking error in gains and
   masses through a hundred steps, in reverse;
@@ -22,11 +23,19 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from importlib import metadata, util
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 BENCHMARKS = ROOT / "kernels" / "benchmarks"
+STIFFNESS = [600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0]
+DAMPING = [50.0, 50.0, 50.0, 50.0, 30.0, 25.0, 15.0]
+"""Gains of the ensemble's controller [N m/rad, N m s/rad], a joint each."""
+AMPLITUDE, FREQUENCY = 0.3, 0.4
+"""Of every joint's motion [rad, Hz]."""
+FUSED = "--xla_backend_extra_options=-nvptx-fma-level=2"
+"""Lets the compiler make one instruction of a product and a sum, which JAX's does not on its own."""
 
 
 def ensemble(arms: int, seconds: float, limit: float, steps_of_gradient: int) -> dict:
@@ -35,6 +44,9 @@ def ensemble(arms: int, seconds: float, limit: float, steps_of_gradient: int) ->
     import jax.numpy as jnp
     import mujoco
     from mujoco import mjx
+
+    sys.path.insert(0, str(BENCHMARKS))
+    from rnea import undisturbed
 
     from jaxpanda.export import panda_mjcf
 
@@ -57,38 +69,39 @@ def ensemble(arms: int, seconds: float, limit: float, steps_of_gradient: int) ->
         return mass, com, inertia
 
     def wanted(t):
-        phase = 2 * jnp.pi * 0.4 * t
-        return middle + 0.3 * jnp.sin(phase), 0.3 * 2 * jnp.pi * 0.4 * jnp.cos(phase) * jnp.ones(7)
+        speed = 2 * jnp.pi * FREQUENCY
+        velocity = AMPLITUDE * speed * jnp.cos(speed * t)
+        return middle + AMPLITUDE * jnp.sin(speed * t), velocity * jnp.ones(7)
 
-    def step(gains, arm, data, k):
+    def step(gains, arm, state, k):
+        """State: position, velocity, and the bias force of the step before, which the controller adds."""
         mass, com, inertia = arm
-        one = base.replace(body_mass=mass, body_ipos=com, body_inertia=inertia)
-        q, qd = wanted(k * dt)
-        u = gains[0] * (q - data.qpos) + gains[1] * (qd - data.qvel) + data.qfrc_bias
-        data = mjx.step(one, data.replace(qfrc_applied=u))
-        return data, jnp.mean((wanted((k + 1) * dt)[0] - data.qpos) ** 2)
+        # The gain on velocity is the model's damping, which the integrator takes implicitly: as a torque held for
+        # a step it is unstable on links this light (stable.py).
+        one = base.replace(body_mass=mass, body_ipos=com, body_inertia=inertia, dof_damping=gains[1])
+        (q, qd), (x, v, bias) = wanted(k * dt), state
+        u = gains[0] * (q - x) + gains[1] * qd + bias
+        data = mjx.step(one, blank.replace(qpos=x, qvel=v, qfrc_applied=u))
+        error = jnp.mean((wanted((k + 1) * dt)[0] - data.qpos) ** 2)
+        return (data.qpos, data.qvel, data.qfrc_bias), error
 
     def begin():
-        q, qd = wanted(0.0)
-        return blank.replace(qpos=q.astype(kind), qvel=qd.astype(kind))
+        return (*(x.astype(kind) for x in wanted(0.0)), jnp.zeros(7, kind))
 
     @jax.jit
     def run(gains, arm, steps):
         def one(arm):
             def body(k, state):
-                data, total = state
-                data, error = step(gains, arm, data, k)
-                return data, total + error
+                now, total = state
+                now, error = step(gains, arm, now, k)
+                return now, total + error
 
-            data, total = jax.lax.fori_loop(0, steps, body, (begin(), jnp.zeros((), kind)))
-            return data.qpos, jnp.sqrt(total / steps)
+            (q, *_), total = jax.lax.fori_loop(0, steps, body, (begin(), jnp.zeros((), kind)))
+            return q, jnp.sqrt(total / steps)
 
         return jax.vmap(one)(arm)
 
-    gains = (
-        jnp.array([600, 600, 600, 600, 250, 150, 50], kind),
-        jnp.array([50, 50, 50, 50, 30, 25, 15], kind),
-    )
+    gains = jnp.array(STIFFNESS, kind), jnp.array(DAMPING, kind)
     arm = vary(jax.random.PRNGKey(0))
     device = jax.devices()[0]
 
@@ -100,14 +113,15 @@ def ensemble(arms: int, seconds: float, limit: float, steps_of_gradient: int) ->
     began = time.perf_counter()
     jax.block_until_ready(run(gains, arm, 1))
     result["first_call_s"] = time.perf_counter() - began
-    began, few = time.perf_counter(), 100
-    jax.block_until_ready(run(gains, arm, few))
-    a_step = (time.perf_counter() - began) / few
-    whole = round(seconds / dt)
-    steps = min(whole, max(few, int(limit / a_step)))
-    began = time.perf_counter()
-    q, error = jax.block_until_ready(run(gains, arm, steps))
-    wall = time.perf_counter() - began
+    whole, few = round(seconds / dt), 100
+    with undisturbed():
+        began = time.perf_counter()
+        jax.block_until_ready(run(gains, arm, few))
+        a_step = (time.perf_counter() - began) / few
+        steps = min(whole, max(few, int(limit / a_step)))
+        began = time.perf_counter()
+        q, error = jax.block_until_ready(run(gains, arm, steps))
+        wall = time.perf_counter() - began
     result |= {
         "simulated_s_each": steps * dt,
         "wall_s": wall,
@@ -121,7 +135,7 @@ def ensemble(arms: int, seconds: float, limit: float, steps_of_gradient: int) ->
 
     def cost(gains, arm):
         def one(arm):
-            ahead = jax.checkpoint(lambda data, k: step(gains, arm, data, k))
+            ahead = jax.checkpoint(lambda state, k: step(gains, arm, state, k))
             return jnp.mean(jax.lax.scan(ahead, begin(), jnp.arange(steps_of_gradient))[1])
 
         return jnp.mean(jax.vmap(one)(arm))
@@ -133,9 +147,10 @@ def ensemble(arms: int, seconds: float, limit: float, steps_of_gradient: int) ->
             began = time.perf_counter()
             value, (by_gain, by_arm) = jax.block_until_ready(gradient(gains, some))
             first = time.perf_counter() - began
-            began = time.perf_counter()
-            jax.block_until_ready(gradient(gains, some))
-            wall = time.perf_counter() - began
+            with undisturbed():
+                began = time.perf_counter()
+                jax.block_until_ready(gradient(gains, some))
+                wall = time.perf_counter() - began
         except Exception as error:  # memory: fewer arms
             result.setdefault("gradient_failed", {})[count] = str(error)[:200]
             continue
@@ -204,56 +219,67 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, required=True, help="file for the figures (JSON)")
-    parser.add_argument("--seconds", type=float, default=360, help="of all parts together")
-    parser.add_argument("--batch", type=int, default=16_777_215)
+    parser.add_argument("--seconds", type=float, default=600, help="for all parts")
+    parser.add_argument("--batch", type=int, default=2**23 - 1)
     parser.add_argument("--arms", type=int, default=10_000)
-    parser.add_argument("--tiny", action="store_true", help="sizes that a processor bears")
-    parser.add_argument("--only", nargs="+", help="of derivatives, rnea, ensemble, mjx")
+    parser.add_argument(
+        "--tiny", action="store_true", help="sizes that a processor bears, one part at a time"
+    )
+    parser.add_argument("--only", nargs="+", help="parts whose name begins so")
     parser.add_argument("--ensemble", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.ensemble:
         print(json.dumps(ensemble(**json.loads(args.ensemble))))
         return
-    batch, rounds, arms, lasts = (257, "1", 4, 0.2) if args.tiny else (args.batch, "3", args.arms, 10.0)
-    groups = ["3"] if args.tiny else ["2", "1", "3", "5"]
+    batch, rounds, arms, lasts = (257, "1", 4, 0.2) if args.tiny else (args.batch, "5", args.arms, 10.0)
     engine = util.find_spec("mujoco") is not None and util.find_spec("mujoco.mjx") is not None
-    result: dict = {"machine": machine(), "batch": batch, "arms": arms}
+    result: dict = {"machine": machine(), "batch": batch, "arms": arms, "parts": {}}
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        figures = Path(folder) / "derivatives.json"
+        shared = {
+            "JAXPANDA_TURNS": str(Path(folder) / "turns"),
+            "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+        }
         options = {"arms": arms, "seconds": lasts, "limit": 60, "steps_of_gradient": 100}
         if args.tiny:
             options |= {"limit": 5, "steps_of_gradient": 10}
+        parts: dict[str, tuple[list[str], dict[str, str]]] = {}
+        if engine:
+            parts["ensemble"] = [__file__, "--out", str(args.out), "--ensemble", json.dumps(options)], {}
+        else:
+            result["not measured"] = "ensemble, mjx: mujoco and mujoco-mjx are not installed"
         derivatives = [str(BENCHMARKS / "derivatives.py"), "--gpu", "--rounds", rounds]
-        parts = {
-            "derivatives": ([*derivatives, "--batch", str(batch), "--groups", *groups,
-                             "--out", str(figures)], 0.45),
-            "rnea": ([str(BENCHMARKS / "rnea.py"), "--batch", str(batch), "--rounds", rounds,
-                      "--child", "0", folder], 0.2),
-            "ensemble": ([__file__, "--out", str(args.out), "--ensemble", json.dumps(options)], 0.5),
-            "mjx": ([*derivatives, "--batch", "257", "--groups", "--mjx", "--out", str(figures)], 0.2),
-        }  # fmt: skip
-        for name, (command, share) in parts.items():
-            left = args.seconds - (time.perf_counter() - began)
-            if args.only and name not in args.only:
-                continue
-            if name in ("ensemble", "mjx") and not engine:
-                result[name] = {"not measured": "mujoco and mujoco-mjx are not installed"}
-            elif left < 20:
-                result[name] = {"not measured": "no time left"}
-            else:
-                figures.unlink(missing_ok=True)
-                found = run(command, min(left, share * args.seconds))
-                if figures.exists():
-                    found["figures"] = json.loads(figures.read_text())
-                elif (document := last_json(found["output"])) is not None:
-                    found["figures"] = document
-                if found["status"] == 0 and "figures" in found and name not in ("derivatives", "mjx"):
-                    del found["output"]
-                result[name] = found
-            print(name, json.dumps(result[name])[:3000], flush=True)
-            args.out.parent.mkdir(parents=True, exist_ok=True)
-            args.out.write_text(json.dumps(result, indent=1) + "\n", "utf-8")
+        for name, own in (("", {}), (", fused multiply-adds", {"XLA_FLAGS": FUSED})):
+            rnea = ["--batch", str(batch), "--rounds", rounds, "--child", "0", folder]
+            parts["rnea" + name] = [str(BENCHMARKS / "rnea.py"), *rnea], own
+            for kind in ("float32", "float64"):
+                more = ["--batch", str(batch // 2 | 1), "--dtypes", kind]
+                parts[f"derivatives {kind}{name}"] = [*derivatives, *more], own
+            if engine and not name:
+                parts["mjx"] = [*derivatives, "--groups", "--mjx"], {}
+
+        def measured(name: str) -> dict:
+            command, own = parts[name]
+            file = Path(folder) / f"{name}.json"
+            if "derivatives.py" in command[0]:
+                command = [*command, "--out", str(file)]
+            found = run(command, max(1, args.seconds - (time.perf_counter() - began)), shared | own)
+            figures = json.loads(file.read_text()) if file.exists() else last_json(found["output"])
+            if figures is not None:
+                found["figures"] = figures
+                found.pop("output")
+            return found
+
+        chosen = [name for name in parts if not args.only or name.startswith(tuple(args.only))]
+        # The compiler takes most of the time, on the host: parts go together and measure in turn. Their arrays
+        # must all find room: three parts hold up to 60 GiB; ten ran out of the 80 of an H100.
+        with ThreadPoolExecutor(1 if args.tiny else 3) as pool:
+            waiting = {pool.submit(measured, name): name for name in chosen}
+            for done in as_completed(waiting):
+                result["parts"][waiting[done]] = found = done.result()
+                print(waiting[done], json.dumps(found)[-3000:], flush=True)
+                args.out.parent.mkdir(parents=True, exist_ok=True)
+                args.out.write_text(json.dumps(result, indent=1) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

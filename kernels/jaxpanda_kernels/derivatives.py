@@ -51,7 +51,7 @@ from .scalars import (
     times,
     transpose,
 )
-from .staging import Stage, alone, in_chunks
+from .staging import Stage, alone, in_chunks, in_registers
 
 Z: Vector = (0.0, 0.0, 1.0)
 
@@ -466,18 +466,22 @@ def _groups(arm: Geometry, count: int, mass: bool) -> tuple[tuple[Pair, ...], ..
     return tuple(tuple(ordered[i : i + size]) for i in range(0, len(ordered), size))
 
 
-def _in_groups(arm: Geometry, phi, q, qd, qdd, count: int, mass: bool = True):
-    every = [_some(arm, group, phi, q, qd, qdd) for group in _groups(arm, count, mass)]
+def _program(f: Callable, *arguments):
+    return (in_registers if jax.default_backend() == "gpu" else alone)(f, *arguments)
+
+
+def _in_groups(arm: Geometry, phi, q, qd, qdd, count: int, mass: bool = True, program: Callable = _program):
+    every = [_some(arm, group, program, phi, q, qd, qdd) for group in _groups(arm, count, mass)]
     return {pair: column for group in every for pair, column in group.items()}
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _some(arm: Geometry, group: tuple[Pair, ...], phi, q, qd, qdd):
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _some(arm: Geometry, group: tuple[Pair, ...], program: Callable, phi, q, qd, qdd):
     def chosen(bodies, q, qd, qdd):
         found = of_columns(arm, bodies, q, qd, qdd)
         return {pair: found[pair] for pair in group}
 
-    return alone(chosen, batched._bodies(arm, phi, q[0]), q, qd, qdd)
+    return program(chosen, batched._bodies(arm, phi, q[0]), q, qd, qdd)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -495,12 +499,14 @@ def _forward_entries(arm: Geometry, phi, q, qd, tau, armature):
 @functools.partial(jax.jit, static_argnums=0)
 def _accelerations(arm: Geometry, phi, q, qd, tau, armature):
     rotors = list(armature.astype(q[0].dtype))
-    return alone(functools.partial(accelerations, arm), batched._bodies(arm, phi, q[0]), q, qd, tau, rotors)
+    return _program(
+        functools.partial(accelerations, arm), batched._bodies(arm, phi, q[0]), q, qd, tau, rotors
+    )
 
 
 @functools.partial(jax.jit, static_argnums=2)
 def _through(inverse, torque, what):
-    return alone(lambda a, b: through(a, b, what), inverse, torque)
+    return _program(lambda a, b: through(a, b, what), inverse, torque)
 
 
 def _upper(inverse: Sequence[Sequence[Scalar]]) -> dict[Pair, Scalar]:

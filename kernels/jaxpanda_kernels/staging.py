@@ -7,6 +7,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+THREADS = 128
+"""Of a block on a GPU."""
+
 T = TypeVar("T")
 
 
@@ -36,6 +39,53 @@ def alone(f: Callable[..., T], *arguments: Any) -> T:
         return lax.optimization_barrier(compute(*values))
 
     return restore(lax.platform_dependent(*values, cpu=looped, default=fenced))
+
+
+def in_registers(f: Callable[..., T], *arguments: Any, interpret: bool = False) -> T:
+    """`f(*arguments)` in one kernel of a GPU, a sample a thread: nothing but arguments and results moves.
+
+    For programs with so many results that XLA cuts them into kernels which hand on more than they deliver. Triton
+    takes a few primitives, among them all of plain arithmetic. As with `alone`, floats stay floats, and reverse
+    mode computes `f` again.
+
+    Args:
+        f: gives arrays (samples,), each number by itself from those of the same sample.
+        arguments: trees of arrays (samples,) and (), of one dtype.
+        interpret: run it without a GPU, slowly.
+    """
+    from jax.experimental import pallas as pl  # a third of a second, that only a GPU needs
+    from jax.experimental.pallas import triton
+
+    compute, values, restore = _of_arrays(f, arguments)
+    places = [k for k, x in enumerate(values) if x.ndim]
+    single = [k for k, x in enumerate(values) if not x.ndim]  # handed over as one array
+    count = values[places[0]].shape[0]
+
+    def kernel(numbers: Any, *refs: Any) -> None:
+        here = THREADS * pl.program_id(0) + jnp.arange(THREADS)
+        filled = here < count
+        own = {
+            k: triton.load(ref.at[here], mask=filled, other=0) for k, ref in zip(places, refs, strict=False)
+        }
+        own |= {k: numbers[i] for i, k in enumerate(single)}
+        results = compute(*(own[k] for k in range(len(values))))
+        for ref, result in zip(refs[len(places) :], results, strict=True):
+            triton.store(ref.at[here], result, mask=filled)
+
+    @jax.custom_jvp
+    def run(*values: jax.Array) -> list[jax.Array]:
+        call = pl.pallas_call(
+            kernel,
+            jax.eval_shape(compute, *values),
+            grid=(pl.cdiv(count, THREADS),),
+            compiler_params=triton.CompilerParams(num_warps=THREADS // 32),
+            interpret=interpret,
+        )
+        numbers = jnp.stack([*(values[k] for k in single), jnp.zeros_like(values[0], shape=())])
+        return list(call(numbers, *(values[k] for k in places)))
+
+    run.defjvp(lambda primals, tangents: jax.jvp(jax.checkpoint(compute), primals, tangents))
+    return restore(run(*values))
 
 
 Stage: TypeAlias = Callable[..., Any]

@@ -73,7 +73,7 @@ def sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, ".
     if x.dtype not in (jnp.float32, jnp.float64):
         raise TypeError(f"sincos takes float32 or float64; got {x.dtype}")
     constants = _DOUBLE if x.dtype == jnp.float64 else _SINGLE
-    k = jnp.round(x * 0.6366197723675814)
+    k = jnp.floor(x * 0.6366197723675814 + 0.5)
     r = x
     for part in constants.half_pi:
         r = r - k * part

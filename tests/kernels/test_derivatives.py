@@ -11,6 +11,7 @@ import pinocchio
 import pytest
 from helpers import random_bodies, random_chain, states, to_mujoco, to_pinocchio
 from jaxpanda_kernels import Chain, columns, derivatives
+from jaxpanda_kernels.staging import alone, in_registers
 from numpy.testing import assert_allclose
 
 from jaxpanda.panda import panda
@@ -197,11 +198,33 @@ def test_programs_of_a_gpu_are_the_same_numbers():
     case = case_of("turn, slide, slide")
     arm = columns.specialise(case.chain)
     state = [[x[:, i] for i in range(3)] for x in case.motion]
-    found = derivatives._in_groups(arm, case.phi, *state, count=2)
-    for (what, i, j), column in found.items():
-        close(column, getattr(case.inverse, what)[:, i, j], 1e-12)
+    for count, program in ((2, alone), (1, ONE_KERNEL)):
+        found = derivatives._in_groups(arm, case.phi, *state, count=count, program=program)
+        for (what, i, j), column in found.items():
+            close(column, getattr(case.inverse, what)[:, i, j], 1e-12)
     inverse, qdd = derivatives._accelerations(arm, case.phi, *state, case.armature)
     torque = derivatives._in_groups(arm, case.phi, *state[:2], qdd, count=1, mass=False)
     for what in ("q", "qd"):
         for (_, i, j), column in derivatives._through(inverse, torque, what).items():
             close(column, getattr(case.forward, what)[:, i, j], 1e-12)
+
+
+ONE_KERNEL = functools.partial(in_registers, interpret=True)
+
+
+def test_one_kernel_can_be_differentiated_and_mapped_and_takes_any_number_of_samples():
+    def f(numbers, x):
+        return [numbers[0] * x[0] * x[1], jnp.sin(x[1]) - numbers[1], 2.0]
+
+    x = [jnp.linspace(0, 1, 300), jnp.linspace(2, 3, 300)]
+
+    def size(run, a):
+        u, v, constant = run(f, [a, 0.5], x)
+        return jnp.sum(u**2) + jnp.sum(v) + constant
+
+    direct, kernel = (
+        jax.jit(functools.partial(size, run)) for run in (lambda f, *given: f(*given), ONE_KERNEL)
+    )
+    a = jnp.array([0.3, 0.7])
+    for transform in (lambda g: g, jax.grad, jax.jacfwd):
+        close(jax.vmap(transform(kernel))(a), jax.vmap(transform(direct))(a), 1e-14)
