@@ -204,7 +204,7 @@ def validate(
     notes = [*source.notes, *notes]
 
     states = _states(motions)
-    reference = _mujoco_inverse(source, *states)
+    reference = mujoco_inverse(source, *states)
     kernel = _difference(_kernel_inverse(arm, *states), reference)
     jax_apart = None if mjx is None else _difference(_mjx_inverse(mjx, bare, *states), reference)
     limit = AGREEMENT * max(1.0, float(np.abs(reference).max()))
@@ -408,7 +408,7 @@ def _inverse_dynamics(arm: Arm, q, qd, qdd):
 
 
 @own_log()
-def _mujoco_inverse(source: MjcfSource, q, qd, qdd) -> Float[np.ndarray, "time dof"]:
+def mujoco_inverse(source: MjcfSource, q, qd, qdd) -> Float[np.ndarray, "time dof"]:
     """`mj_inverse` of the user's whole model, gripper and scene included, with only smooth forces on."""
     model = _smooth(source.model)
     data = mujoco.MjData(model)

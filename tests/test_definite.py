@@ -7,8 +7,8 @@ import pytest
 from jaxpanda.feasible import definite
 
 WAYS = {
-    "library": (definite._cholesky, definite._substitute),
-    "blocks": (definite._by_blocks, definite._substitute_by_blocks),
+    "library": (definite.cholesky, definite.substitute),
+    "blocks": (definite.by_blocks, definite.substitute_by_blocks),
     "platform": (definite.factor, definite.solve),
 }
 
