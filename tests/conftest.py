@@ -1,7 +1,7 @@
 """Strict in tests, relaxed for users: float64, warnings as errors, shapes checked at run time.
 
-Most of what tests take is compilation. XLA's older emitters of loops for CPUs with LLVM's least optimisation take a
-sixth of the time, for programs that take twice as long to run: right where a program runs once or twice. With
+Most of what tests take is compilation. XLA's older emitters of loops for CPUs, with LLVM's least optimisation, take
+a sixth of the time for programs that take twice as long to run: right where a program runs once or twice. With
 `XLA_FLAGS` in the environment, if only a space, tests run on XLA as that says. What was compiled is kept in
 `.pytest_cache`, for workers and subprocesses to share and for the next run.
 """
@@ -36,7 +36,7 @@ from jaxpanda_kernels import scalars  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
-# Products and sums of single numbers, each of which took longer to check than to trace; their callers are checked.
+# Products and sums of single numbers took longer to check than to trace; their callers are checked.
 for function in filter(inspect.isfunction, vars(scalars).values()):
     function.__no_type_check__ = True
 
