@@ -605,7 +605,8 @@ def _rollout_mjx(mjx: Any, bare: mujoco.MjModel, tasks: Sequence[_Task], law: _F
     motions, feedback = [], []
     for task in tasks:
         q, qd, tau = (hold(x) for x in (task.q, task.qd, task.tau))
-        data, parts = blank.replace(qpos=q[0], qvel=qd[0]), []
+        # where MJX put the rest: arrays bound to a device and arrays that are not are compiled for apart
+        data, parts = jax.device_put(blank.replace(qpos=q[0], qvel=qd[0]), blank.qpos.sharding), []
         for first in range(0, len(q), _CHUNK):
             here = slice(first, first + _CHUNK)
             data, part = run(data, q[here], qd[here], tau[here])

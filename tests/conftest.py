@@ -1,7 +1,7 @@
-"""Strict in tests, relaxed for users: float64, warnings as errors, shapes checked at run time.
+"""Strict in tests, relaxed for users: float64, warnings as errors, shapes checked at run time (but in slow ones).
 
-Most of what tests take is compilation. XLA's older emitters of loops for CPUs, with LLVM's least optimisation, take
-a sixth of the time for programs that take twice as long to run: right where a program runs once or twice. With
+Most of what tests take is compilation. XLA's older emitters of loops, with LLVM's least optimisation, take a
+sixth of the time for programs that take twice as long to run: right where a program runs once or twice. With
 `XLA_FLAGS` in the environment, if only a space, tests run on XLA as that says. What was compiled is kept in
 `.pytest_cache`, for workers and subprocesses to share and for the next run.
 """
@@ -32,6 +32,7 @@ if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = " ".join(f"--{k}={v}" for k, v in QUICK_TO_COMPILE.items() if knows(k))
 
 import jax  # noqa: E402
+import jaxtyping  # noqa: E402
 from jaxpanda_kernels import scalars  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
@@ -49,6 +50,11 @@ def pytest_configure(config: pytest.Config) -> None:
         # for subprocesses, and for commands, which then keep theirs there too and not in the user's home
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(seconds)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    # A quarter of a diagnosis: what is slow runs as users have it, without shapes checked.
+    jaxtyping.config.update("jaxtyping_disable", item.get_closest_marker("slow") is not None)
 
 
 @pytest.fixture(scope="session")

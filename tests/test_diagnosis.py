@@ -123,6 +123,7 @@ def test_the_page_stands_alone_and_escapes_what_users_named(found, tmp_path):
     assert text.count("<svg") >= 3
 
 
+@pytest.mark.slow
 def test_two_effects_are_both_found_and_nothing_else():
     def both(t, q, qd, qdd):
         return at_joint(2, lambda t, q, qd, qdd: 0.5 * qd[:, 1])(t, q, qd, qdd) + np.eye(7)[5] * 0.2
