@@ -52,6 +52,39 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(seconds)
 
 
+LONGEST = (
+    *(
+        "real_arms",
+        "diagnosis",
+        "decide",
+        "commands",
+        "feasible",
+        "batched",
+        "ensemble",
+        "readme_chain",
+        "demo",
+    ),
+    *("retrieval", "validation", "comparison", "fleet", "next_motion", "discrepancy", "dynamics", "rollout"),
+    *(
+        "excitation",
+        "own_effects",
+        "resting",
+        "effects",
+        "hostile",
+        "scale",
+        "known",
+        "localise",
+        "derivatives",
+    ),
+)
+"""Files that take long, the longest first: one that begins when the others end is waited for."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    order = {f"test_{name}.py": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     # A quarter of a diagnosis: what is slow runs as users have it, without shapes checked.
     jaxtyping.config.update("jaxtyping_disable", item.get_closest_marker("slow") is not None)
