@@ -89,7 +89,7 @@ def test_the_python_chain_is_that_of_the_commands(data, identified, retrieved):
 
 @pytest.mark.slow
 def test_the_demo_on_the_real_recording_is_the_same_chain(data, tmp_path):
-    done = jaxpanda.demonstrate(tmp_path / "demo", recordings=[data / "gaz_panda"], starts=256)
+    done = jaxpanda.demonstrate(tmp_path / "demo", recordings=[data / "gaz_panda"], starts=64)
     assert done.validation.relative_error_percent <= FITTED
     assert done.retrieval.cross_validated_relative_error_percent <= HELD_OUT
     assert done.validation.mjx_vs_mujoco < 1e-9
