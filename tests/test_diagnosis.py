@@ -120,7 +120,7 @@ def test_the_page_stands_alone_and_escapes_what_users_named(found, tmp_path):
     assert all(url.startswith("http://www.w3.org/") for url in outside)
     for part in ("1. stribeck friction at joint 5", "95 % interval", "What would have shown", "Every effect"):
         assert part in text
-    assert text.count("<svg") >= 3
+    assert text.count("<svg") >= 2  # of the finding, and of the recording
 
 
 @pytest.mark.slow
@@ -376,7 +376,6 @@ def test_a_body_that_is_put_down_is_one_finding():
     assert found[0].confidence > 0.5
 
 
-@pytest.mark.slow
 def test_a_joint_that_never_moved_is_not_judged_and_that_is_said():
     one = record(30, lambda t, q, qd, qdd: np.eye(7)[3] * 5.0 * np.ones((len(t), 1)), still=(3,))
     found = diagnose(None, [one])
