@@ -126,7 +126,7 @@ class Convention:
             notes.append(f"tau multiplied by {' '.join(f'{k:g}' for k in factors)}")
         if tau is not None and arm is not None:
             recording.require_dof(arm.dof)
-            tau = tau + _weight(arm, q)
+            tau = tau + weight_torque(arm, q)
             notes.append("the model's gravity torque was added to tau, so that it tells nothing of weights")
         notes = (*recording.notes, *(f"as asked, {note}" for note in notes))
         return dataclasses.replace(recording, q=q, qd=qd, tau=tau, notes=notes)
@@ -168,7 +168,7 @@ def _unit(word: str) -> float:
     return value
 
 
-def _weight(arm: "Arm", q):
+def weight_torque(arm: "Arm", q):
     """Gravity torque of the model [N m]."""
     import jax
     import numpy as np

@@ -727,11 +727,11 @@ def _link_frame(model: mujoco.MjModel, joint: int) -> tuple[np.ndarray, np.ndarr
     slides = model.jnt_type[joint] == _SLIDE
     upright = np.array_equal(axis, [0, 0, 1])
     through_origin = upright and not np.any(np.cross(axis, position))
-    R = np.eye(3) if upright else _smallest_turn(axis)
+    R = np.eye(3) if upright else smallest_turn(axis)
     return R, np.zeros(3) if slides or through_origin else position.copy()
 
 
-def _smallest_turn(axis: np.ndarray) -> np.ndarray:
+def smallest_turn(axis: np.ndarray) -> np.ndarray:
     """Rotation by the smallest angle that takes z to `axis`; about x where they are opposite."""
     x, y, c = axis / np.linalg.norm(axis)
     s = np.hypot(x, y)

@@ -417,7 +417,7 @@ def _in_mjx(bare: mujoco.MjModel, plant: Plant, gains: Gains, task: Task) -> tup
 
 
 @own_log()
-def _in_mujoco(bare: mujoco.MjModel, plant: Plant, gains: Gains, task: Task) -> tuple[np.ndarray, ...]:
+def in_mujoco(bare: mujoco.MjModel, plant: Plant, gains: Gains, task: Task) -> tuple[np.ndarray, ...]:
     """C MuJoCo, step by step."""
     model, dt = copy.copy(bare), float(bare.opt.timestep)
     data = mujoco.MjData(model)
@@ -468,7 +468,7 @@ def _replay(
     bare: mujoco.MjModel, plant: Plant, task: Task, gains: Gains, name: str, engine: Engine
 ) -> Replay:
     begin = clock.perf_counter()
-    run = {"mujoco": _in_mujoco, "mjx": _in_mjx}.get(engine)
+    run = {"mujoco": in_mujoco, "mjx": _in_mjx}.get(engine)
     if run is None:
         raise InputError(f"unknown engine {engine!r}; there are mujoco, mjx")
     shown, tau, added = run(bare, plant, gains, task)

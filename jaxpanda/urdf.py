@@ -55,7 +55,7 @@ def to_urdf(
             kind = "continuous"
         else:
             limits = f'lower="{-UNLIMITED}" upper="{UNLIMITED}" {limits}'
-        rpy = _rpy(np.asarray(arm.chain.R[i], float))
+        rpy = roll_pitch_yaw(np.asarray(arm.chain.R[i], float))
         lines += [
             f'  <joint name="{quote(arm.joint_names[i])}" type="{kind}">',
             f'    <parent link="{quote(parents[i])}"/>',
@@ -116,7 +116,7 @@ def _base(arm: Arm) -> str:
     return "base_link" if "base_link" not in arm.link_names else "world"
 
 
-def _rpy(R: np.ndarray) -> np.ndarray:
+def roll_pitch_yaw(R: np.ndarray) -> np.ndarray:
     """Roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll), exact to rounding also at pitch = ±90 degrees."""
     yaw = np.arctan2(R[1, 0], R[0, 0]) if R[0, 0] or R[1, 0] else 0.0
     c, s = np.cos(yaw), np.sin(yaw)

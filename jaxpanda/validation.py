@@ -204,7 +204,7 @@ def validate(
     notes = [*source.notes, *notes]
 
     states = _states(motions)
-    reference = _mujoco_inverse(source, *states)
+    reference = mujoco_inverse(source, *states)
     kernel = _difference(_kernel_inverse(arm, *states), reference)
     jax_apart = None if mjx is None else _difference(_mjx_inverse(mjx, bare, *states), reference)
     limit = AGREEMENT * max(1.0, float(np.abs(reference).max()))
@@ -408,7 +408,7 @@ def _inverse_dynamics(arm: Arm, q, qd, qdd):
 
 
 @own_log()
-def _mujoco_inverse(source: MjcfSource, q, qd, qdd) -> Float[np.ndarray, "time dof"]:
+def mujoco_inverse(source: MjcfSource, q, qd, qdd) -> Float[np.ndarray, "time dof"]:
     """`mj_inverse` of the user's whole model, gripper and scene included, with only smooth forces on."""
     model = _smooth(source.model)
     data = mujoco.MjData(model)
@@ -605,7 +605,8 @@ def _rollout_mjx(mjx: Any, bare: mujoco.MjModel, tasks: Sequence[_Task], law: _F
     motions, feedback = [], []
     for task in tasks:
         q, qd, tau = (hold(x) for x in (task.q, task.qd, task.tau))
-        data, parts = blank.replace(qpos=q[0], qvel=qd[0]), []
+        # where MJX put the rest: arrays bound to a device and arrays that are not are compiled for apart
+        data, parts = jax.device_put(blank.replace(qpos=q[0], qvel=qd[0]), blank.qpos.sharding), []
         for first in range(0, len(q), _CHUNK):
             here = slice(first, first + _CHUNK)
             data, part = run(data, q[here], qd[here], tau[here])

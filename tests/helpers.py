@@ -1,6 +1,7 @@
 """Random arms and states, and the same arms in other people's engines."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,13 +68,21 @@ def excitation(arm: Arm, t: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarr
 
 
 def record(
-    seed: int, extra=None, *, seconds: float = 8.0, rate: float = 200.0, arm: Arm | None = None
+    seed: int,
+    extra=None,
+    *,
+    seconds: float = 8.0,
+    rate: float = 200.0,
+    arm: Arm | None = None,
+    still: Sequence[int] = (),
 ) -> Recording:
-    """A Fourier motion of the project's Panda with noise of 0.05 N m; `extra` is added to the torque."""
+    """A Fourier motion of the project's Panda with noise of 0.05 N m; `extra` is added to the torque, and joints
+    that are `still` never move."""
     arm, rng = arm or Arm.panda(), np.random.default_rng(seed)
     t = np.arange(int(seconds * rate)) / rate
     w = 2 * np.pi * np.array([0.1, 0.2, 0.3, 0.5])
     a, b = rng.normal(0, 0.12, (2, 4, 7)) / np.array([1, 1.5, 2, 3])[:, None]
+    a[:, still], b[:, still] = 0.0, 0.0
     phase = w[:, None] * t
     q = 0.5 * np.asarray(arm.lower + arm.upper) + np.sin(phase).T @ a + np.cos(phase).T @ b
     qd = (w[:, None] * np.cos(phase)).T @ a - (w[:, None] * np.sin(phase)).T @ b
@@ -81,7 +90,9 @@ def record(
     tau = Motion(arm, t, q, qd, qdd, np.zeros_like(q)).load + NOISE * rng.normal(size=q.shape)
     if extra is not None:
         tau = tau + extra(t, q, qd, qdd)
-    return Recording(f"motion_{seed}.csv", t, q + 1e-5 * rng.normal(size=q.shape), qd=qd, tau=tau)
+    read = q + 1e-5 * rng.normal(size=q.shape)
+    read[:, still] = q[:, still]
+    return Recording(f"motion_{seed}.csv", t, read, qd=qd, tau=tau)
 
 
 def half_correlated(rng: np.random.Generator, shape: tuple[int, ...], keep: float) -> np.ndarray:

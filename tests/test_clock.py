@@ -6,7 +6,7 @@ import pytest
 from jaxpanda.errors import InputError
 from jaxpanda.inspection import inspect
 from jaxpanda.recordings import Recording, load, save
-from jaxpanda.recordings.clock import MOVED, on_clock
+from jaxpanda.recordings.clock import on_clock
 from jaxpanda.signals import prepare
 
 DOF = 4
@@ -53,7 +53,7 @@ def test_uniform_samples_are_put_on_their_ticks(rate, jitter):
     np.testing.assert_allclose(made.time, ticks, atol=0.1 * max(jitter, 0.1) / rate)
     np.testing.assert_array_equal(made.stamps, recording.time)
     assert acceleration_error(made) < 0.02
-    assert made.repairs[MOVED] == len(ticks)
+    assert made.repairs["rows moved from their stamp to their tick"] == len(ticks)
     assert "samples were uniform and their stamps were not" in made.notes[-1]
 
 
@@ -146,7 +146,7 @@ def test_every_format_is_put_on_ticks_and_inspect_tells(tmp_path):
     for name in ("arm.csv", "arm.npz", "arm.csv.gz"):
         save(recording, tmp_path / name)
         made = load(tmp_path / name)
-        assert made.repairs[MOVED] == made.samples
+        assert made.repairs["rows moved from their stamp to their tick"] == made.samples
         lines = "\n".join(inspect(made).lines())
         assert "samples were uniform and their stamps were not" in lines
         assert "time is not uniform" not in lines

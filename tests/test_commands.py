@@ -134,17 +134,15 @@ def test_the_chain_of_commands_leaves_what_the_interface_promises(capsys, record
     assert main(["export", "--retrieval", str(run), "--out", str(model)]) == 0
     assert main(["export", "--retrieval", str(run), "--out", str(tmp_path / "found.urdf")]) == 0
     capsys.readouterr()
-    assert (
-        main(["validate", "--model", str(model), "--recording", str(recording), "--out", str(run), "--json"])
-        == 0
-    )
+    given = ["--model", str(model), "--recording", str(recording), "--out", str(run), "--json"]
+    assert main(["validate", *given, "--no-mjx"]) == 0
     out, _ = capsys.readouterr()
     checked = json.loads(out)
     assert checked == result(run / "validation.json")
     assert checked["kernel_vs_mujoco"] < 1e-9
-    assert checked["mjx_vs_mujoco"] < 1e-9
+    assert checked["mjx_vs_mujoco"] is None
     assert checked["relative_error_percent"] < 5
-    assert max(checked["rollout_rmse_rad"]) < 0.2
+    assert max(checked["rollout"]["mujoco"]["rmse_rad"]) < 0.2
 
 
 @pytest.mark.parametrize(
@@ -163,7 +161,7 @@ def test_the_readme_s_example_runs_for_any_arm(own, recording, tmp_path, monkeyp
     if own:
         shutil.copy(recording, "arm.csv")
     else:
-        shutil.copy(MODELS / "odd_axes.xml", "arm.xml")
+        shutil.copy(MODELS / "robosuite_like.xml", "arm.xml")  # three joints
         save(shaken(jaxpanda.Arm.from_mjcf("arm.xml")), Path("arm.csv"))
         text = re.sub(r"^(arm = |)\S.*# or (.*\))$", r"\1\2", text, flags=re.MULTILINE)
         assert text.count('"arm.xml"') == 2

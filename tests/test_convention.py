@@ -126,9 +126,9 @@ def test_a_command_reads_a_log_as_it_is_told(capsys, log, tmp_path):
 
 def test_gravity_that_was_removed_is_added(capsys, log, tmp_path):
     from jaxpanda import Arm
-    from jaxpanda.convention import _weight
+    from jaxpanda.convention import weight_torque
 
-    free = log.tau - _weight(Arm.panda(), log.q)
+    free = log.tau - weight_torque(Arm.panda(), log.q)
     save(Recording("free", log.time, log.q, log.qd, free), tmp_path / "free.csv")
     assert "holds no gravity" in verdicts(capsys, tmp_path / "free.csv")
     assert "gravity is in the torque" in verdicts(capsys, tmp_path / "free.csv", "--gravity", "removed")

@@ -1,4 +1,7 @@
-"""Which name a finding gets, and when it gets none."""
+"""Which name a finding gets, and when it gets none.
+
+What is known to fail is not run: `pytest -m slow --runxfail` tells whether it fails still.
+"""
 
 import dataclasses
 
@@ -10,7 +13,7 @@ from helpers import record
 from jaxpanda import Arm
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.credible import is_of_time
-from jaxpanda.diagnosis.decide import MISLEADS, findings
+from jaxpanda.diagnosis.decide import findings
 from jaxpanda.diagnosis.diagnosis import Fit, verdict
 from jaxpanda.diagnosis.events import windows
 from jaxpanda.diagnosis.finding import Finding
@@ -32,7 +35,8 @@ def posed(*recordings):
 
 
 @pytest.mark.xfail(
-    reason="a link and an unknown are called on beside crosstalk of a joint that misses something itself"
+    run=False,
+    reason="a link and an unknown are called on beside crosstalk of a joint that misses something itself",
 )
 @pytest.mark.slow
 def test_crosstalk_carries_what_its_source_is_missing_too(tmp_path):
@@ -90,7 +94,7 @@ def test_a_strong_linear_spring_far_from_zero_does_not_stiffen():
     assert told["torque_at_zero"] == pytest.approx(90.0, rel=0.01)
 
 
-@pytest.mark.xfail(reason="a ripple of next to no confidence stands beside the spring")
+@pytest.mark.xfail(run=False, reason="a ripple of next to no confidence stands beside the spring")
 @pytest.mark.slow
 def test_a_cable_that_is_slack_on_one_side_is_a_spring_that_gets_taut_where_it_does():
     cable = lambda t, q, qd, qdd: np.eye(7)[5] * (5.0 * np.maximum(q[:, [5]] - 1.9, 0.0))
@@ -105,7 +109,7 @@ def test_a_cable_that_is_slack_on_one_side_is_a_spring_that_gets_taut_where_it_d
 
 
 @pytest.mark.xfail(
-    reason="no single ripple of low order is proposed beside a spring: a spring stays beside it"
+    run=False, reason="no single ripple of low order is proposed beside a spring: a spring stays beside it"
 )
 @pytest.mark.slow
 def test_a_ripple_of_which_little_is_seen_is_no_spring_with_a_ripple_on_it():
@@ -256,7 +260,9 @@ def test_one_cause_of_what_several_joints_show_comes_before_a_cause_for_each():
     assert {t.key for t in found.terms} == {("gravity_direction", tuple(range(7))), ("joint_spring", (2,))}
 
 
-@pytest.mark.xfail(reason="a search that starts from the wrong link replaces one of the springs only")
+@pytest.mark.xfail(
+    run=False, reason="a search that starts from the wrong link replaces one of the springs only"
+)
 @pytest.mark.slow
 def test_two_joints_with_something_of_their_own_are_no_wrong_link_beyond_them():
     springs = lambda t, q, qd, qdd: 20.0 * (q - 0.3) * np.eye(7)[1] + 15.0 * (q + 0.2) * np.eye(7)[2]
@@ -288,7 +294,7 @@ def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_hardly_believe
     (lost,) = findings(problem, state, state, [True])
     assert (sure.effect, lost.effect) == ("coulomb_friction", "coulomb_friction")
     assert sure.confidence > 0.9
-    assert lost.confidence <= MISLEADS
+    assert lost.confidence <= 0.1
 
 
 @pytest.mark.slow
@@ -299,7 +305,7 @@ def test_what_each_recording_shows_otherwise_is_not_explained():
     assert any("predicted no better" in note for note in found.notes)
     assert found.verdict in ("partly_explained", "unexplained")
     named = [f for f in found.findings if f.effect != "unknown"]
-    assert all(f.posterior is not None and f.posterior <= MISLEADS + 1e-9 for f in named)
+    assert all(f.posterior is not None and f.posterior <= 0.1 + 1e-9 for f in named)
     assert all(f.confidence < 0.4 for f in named)  # such claims turned out right in 6 trials of 16
 
 

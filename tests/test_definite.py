@@ -1,4 +1,4 @@
-"""Both ways to factor and solve, by the library and by blocks, give what NumPy gives."""
+"""Both ways to factor and solve, by the library (the platform's, here) and by blocks, give what NumPy gives."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,14 +7,13 @@ import pytest
 from jaxpanda.feasible import definite
 
 WAYS = {
-    "library": (definite._cholesky, definite._substitute),
-    "blocks": (definite._by_blocks, definite._substitute_by_blocks),
+    "blocks": (definite.by_blocks, definite.substitute_by_blocks),
     "platform": (definite.factor, definite.solve),
 }
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("n", [3, 14, 15, 70, 84])
+@pytest.mark.parametrize("n", [3, 14, 15, 70])
 def test_a_system_is_solved_whatever_its_size(way, n):
     factor, solve = WAYS[way]
     rng = np.random.default_rng(n)

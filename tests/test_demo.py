@@ -14,7 +14,7 @@ from jaxpanda.report import Figure, Section, Table, to_html, to_terminal
 
 @pytest.mark.slow
 def test_the_demo_finds_the_virtual_arm_and_leaves_its_files(tmp_path):
-    done = demonstrate(tmp_path / "demo", starts=256)
+    done = demonstrate(tmp_path / "demo", starts=64)
     left = {path.name for path in (tmp_path / "demo").iterdir()}
     assert left == {
         "recording.csv",

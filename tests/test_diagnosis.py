@@ -56,7 +56,7 @@ def stribeck(t, q, qd, qdd):
 
 @pytest.fixture(scope="module")
 def found():
-    return diagnose(None, [record(0, at_joint(5, stribeck)), record(1, at_joint(5, stribeck))])
+    return diagnose(None, [record(0, at_joint(5, stribeck))])
 
 
 def test_nothing_is_reported_when_nothing_is_missing():
@@ -120,14 +120,15 @@ def test_the_page_stands_alone_and_escapes_what_users_named(found, tmp_path):
     assert all(url.startswith("http://www.w3.org/") for url in outside)
     for part in ("1. stribeck friction at joint 5", "95 % interval", "What would have shown", "Every effect"):
         assert part in text
-    assert text.count("<svg") >= 3
+    assert text.count("<svg") >= 2  # of the finding, and of the recording
 
 
+@pytest.mark.slow
 def test_two_effects_are_both_found_and_nothing_else():
     def both(t, q, qd, qdd):
         return at_joint(2, lambda t, q, qd, qdd: 0.5 * qd[:, 1])(t, q, qd, qdd) + np.eye(7)[5] * 0.2
 
-    result = diagnose(None, [record(0, both), record(1, both)])
+    result = diagnose(None, [record(0, both)])
     assert {(f.effect, f.joints) for f in result.findings} == {
         ("viscous_friction", (1,)),
         ("torque_offset", (5,)),
@@ -158,7 +159,7 @@ def test_what_no_effect_explains_is_called_unknown():
     def odd_one(t, q, qd, qdd):
         return 0.3 * np.tanh(qd[:, 2] / 0.01) * np.sin(4 * q[:, 2])
 
-    result = diagnose(None, [record(0, at_joint(3, odd_one)), record(1, at_joint(3, odd_one))])
+    result = diagnose(None, [record(0, at_joint(3, odd_one))])
     assert result.verdict in ("unexplained", "partly_explained")
     assert ("unknown", (2,)) in {(f.effect, f.joints) for f in result.findings}
     assert result.fit.held_out_rmse_after[2] < 0.5 * result.fit.held_out_rmse_before[2]
@@ -186,7 +187,7 @@ def test_a_torque_without_a_name_is_predicted_in_a_motion_never_seen(law, tmp_pa
     np.testing.assert_allclose(np.sqrt(np.mean(error**2, 0)), NOISE, rtol=0.15)
 
 
-@pytest.mark.parametrize("v", [0.005, 0.02])
+@pytest.mark.parametrize("v", [pytest.param(0.005, marks=pytest.mark.slow), 0.02])
 def test_how_known_friction_turns_is_no_finding(v, tmp_path):
     """Not as MuJoCo's constraint: that was called Stribeck's friction, or a drift of it."""
     model = tmp_path / "rubs.xml"
@@ -231,9 +232,7 @@ def test_what_the_healthy_arm_shows_already_is_not_reported():
     def worn(t, q, qd, qdd):
         return np.eye(7)[3] * 0.3
 
-    result = diagnose(
-        None, [record(0, worn)], reference=[record(1, worn), record(2, worn)], knowledge="unknown"
-    )
+    result = diagnose(None, [record(0, worn)], reference=[record(1, worn)], knowledge="unknown")
     assert "torque_offset" not in {f.effect for f in result.findings}
 
 
@@ -377,12 +376,9 @@ def test_a_body_that_is_put_down_is_one_finding():
     assert found[0].confidence > 0.5
 
 
-@pytest.mark.slow
 def test_a_joint_that_never_moved_is_not_judged_and_that_is_said():
-    one = record(30, lambda t, q, qd, qdd: np.eye(7)[3] * 5.0 * np.ones((len(t), 1)))
-    q = one.q.copy()
-    q[:, 3] = q[:, 3].mean()
-    found = diagnose(None, [dataclasses.replace(one, q=q)])
+    one = record(30, lambda t, q, qd, qdd: np.eye(7)[3] * 5.0 * np.ones((len(t), 1)), still=(3,))
+    found = diagnose(None, [one])
     assert not any(3 in f.joints for f in found.findings if f.effect == "torque_offset")
     assert any("joint 4 never moved" in note for note in found.notes)
 

@@ -398,10 +398,10 @@ def test_pinocchio_reads_the_urdf_as_the_same_arm(path):
 def test_roll_pitch_yaw_give_the_rotation_back_even_where_two_of_them_are_one(pitch):
     from scipy.spatial.transform import Rotation
 
-    from jaxpanda.urdf import _rpy
+    from jaxpanda.urdf import roll_pitch_yaw
 
     R = Rotation.from_euler("ZYX", [0.4, pitch, -1.1]).as_matrix()
-    roll, pitch, yaw = _rpy(R)
+    roll, pitch, yaw = roll_pitch_yaw(R)
     np.testing.assert_allclose(Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix(), R, atol=1e-15)
 
 

@@ -339,14 +339,14 @@ def test_bad_usage_is_one_sentence(resting, tmp_path, capsys, given, said):
 @pytest.mark.parametrize("address", ["nowhere", "127.0.0.1:port", "127.0.0.1:99999"])
 def test_an_address_where_nobody_is_is_one_sentence(address):
     with pytest.raises(InputError, match=f"--address {address}: no cluster answers"):
-        crew._require_answer(address)
+        crew.require_answer(address)
 
 
 def test_an_address_where_nobody_listens_is_one_sentence():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # and does not listen
         with pytest.raises(InputError, match="no cluster answers"):
-            crew._require_answer(f"127.0.0.1:{taken.getsockname()[1]}")
+            crew.require_answer(f"127.0.0.1:{taken.getsockname()[1]}")
 
 
 def test_without_ray_one_sentence_says_what_to_install(resting, tmp_path, capsys, monkeypatch):

@@ -80,7 +80,7 @@ def test_the_models_flags_switch_its_physics_off(tmp_path):
 )
 def test_the_turn_that_brings_z_onto_an_axis_is_a_rotation_by_the_smallest_angle(axis):
     axis = np.array(axis) / np.linalg.norm(axis)
-    R = mjcf._smallest_turn(axis)
+    R = mjcf.smallest_turn(axis)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
     np.testing.assert_allclose(np.linalg.det(R), 1)
     np.testing.assert_allclose(R[:, 2], axis, atol=1e-15)
@@ -90,7 +90,7 @@ def test_the_turn_that_brings_z_onto_an_axis_is_a_rotation_by_the_smallest_angle
 def test_host_side_parameters_are_those_of_the_kernels():
     rng = np.random.default_rng(1)
     phi = np.asarray(inertia.from_log_cholesky(jnp.asarray(rng.normal(size=10) / 2)))
-    R, p = mjcf._smallest_turn(rng.normal(size=3)), rng.normal(size=3)
+    R, p = mjcf.smallest_turn(rng.normal(size=3)), rng.normal(size=3)
     np.testing.assert_allclose(
         mjcf.move_standard(phi, R, p), inertia.move(*map(jnp.asarray, (phi, R, p))), rtol=1e-12
     )

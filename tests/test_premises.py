@@ -3,29 +3,12 @@
 import numpy as np
 
 from jaxpanda import Arm
-from jaxpanda.diagnosis.premises import RUNGS, pose
+from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.export import panda_mjcf
 from jaxpanda.simulation import JointFriction, Sensors, random_trajectory, simulate
-
-
-def test_recordings_widen_what_was_identified_and_never_a_promise():
-    """`exact` is a promise; that nothing is known only the user can say."""
-    words = [knowledge for knowledge, _, _ in RUNGS]
-    assert words[0] == "identified"
-    assert set(words) == {"identified", "rough"}
-
-
-def test_each_wider_supposition_of_the_model_s_numbers_is_less_likely_beforehand():
-    words, scales, priors = zip(*RUNGS, strict=True)
-    assert priors[0] == 0.0
-    assert all(np.diff(priors) < 0)
-    for word in set(words):
-        at = [s for w, s in zip(words, scales, strict=True) if w == word]
-        assert at == sorted(set(at))
-        assert at[0] == 1.0
 
 
 def test_what_healthy_recordings_show_may_be_refitted_in_all_recordings():

@@ -168,7 +168,7 @@ def test_a_joint_held_by_dry_friction_creeps_and_does_not_chatter():
     time = jnp.arange(200) * 0.002
     hold, zero = jnp.full((200, 1), 0.5), jnp.zeros((200, 1))
     task, gains = rollout.Task(time, zero, zero, hold), rollout.Gains(jnp.zeros(1), jnp.zeros(1))
-    q = rollout._in_mujoco(rollout.engine_model(source, plant.arm), plant, gains, task)[0]
+    q = rollout.in_mujoco(rollout.engine_model(source, plant.arm), plant, gains, task)[0]
     speed = np.diff(q[:, 0]) / 0.002
     assert (speed[1:] > 0).all()
     np.testing.assert_allclose(speed[50:], 0.002 * np.arctanh(0.5), rtol=1e-3)

@@ -16,7 +16,7 @@ from jaxpanda.__main__ import main
 from jaxpanda.errors import InputError
 from jaxpanda.feasible import Bounds, Solutions, solve
 from jaxpanda.feasible.checkpoint import identity
-from jaxpanda.retrieval import CHECKPOINT_FILE, Retrieval
+from jaxpanda.retrieval import Retrieval
 
 FIELDS = ("phi", "extra", "objective", "violation", "converged", "iterations")
 SMALL = {"starts": 40, "chunk": 8, "seed": 5}
@@ -178,7 +178,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_finishes_it(table, tmp_p
     monkeypatch.setattr(pipeline, "retrieve", stopped)
     assert main(["retrieve", *table, "--out", str(outs[1])]) == 1
     assert "the same command goes on" in capsys.readouterr().err
-    assert [path.name for path in outs[1].iterdir()] == [CHECKPOINT_FILE]
+    assert [path.name for path in outs[1].iterdir()] == ["starts.partial"]
     monkeypatch.setattr(pipeline, "retrieve", original)
     assert main(["retrieve", *table, "--out", str(outs[1])]) == 0
     assert sorted(path.name for path in outs[1].iterdir()) == ["retrieval.json", "starts.npz"]

@@ -67,11 +67,11 @@ def fitted(seed: int, law, effect: AbstractEffect) -> dict[str, tuple[float, flo
     ids=["stribeck", "ripple"],
 )
 def test_the_interval_of_a_parameter_holds_the_truth_as_often_as_it_says(law, effect, truth):
+    """Of 24 intervals at 95 % at most 4 miss: right ones pass 99.4 times of 100, ones of 75 % 25 times and
+    ones of 65 % 4 times."""
     draws = [fitted(seed, law, effect) for seed in range(24)]
     for name, true in truth.items():
         # in logarithms, in which positive numbers spread evenly about their estimate
         off = np.array([np.log(d[name][0] / true) * d[name][0] / d[name][1] for d in draws])
-        held = np.mean(np.abs(off) < 1.96)
-        # 95 % of 24 draws, give or take; much too wide would be no better
-        assert held >= 0.8, (name, off)
-        assert off.std() > 0.4, (name, off)
+        assert np.sum(np.abs(off) > 1.96) <= 4, (name, off)
+        assert off.std() > 0.4, (name, off)  # much too wide would be no better

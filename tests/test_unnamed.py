@@ -50,6 +50,7 @@ def test_a_hum_is_heard_where_it_is_in_and_beyond_the_band(frequency):
 
 
 def test_its_deviations_hold_the_truth():
+    """Of 30 intervals at 95 % at most 5 miss: right ones pass 99.7 times of 100, ones of 65 % 2 times of 100."""
     errors = []
     for seed in range(30):
         found = heard(recording(seed, at_joints(0.08, 31.0 + 0.37 * seed, 2)))
@@ -61,7 +62,7 @@ def test_its_deviations_hold_the_truth():
                 (amplitude["value"] - 0.08) / amplitude["std"],
             ]
         )
-    assert np.all(np.mean(np.abs(errors) < 1.96, 0) > 0.8)
+    assert np.all(np.sum(np.abs(errors) > 1.96, 0) <= 5)
 
 
 def test_noise_is_no_hum():

@@ -307,8 +307,7 @@ def starting_points(
 
     A start depends on its number and the seed alone.
     """
-    drawn = jax.jit(jax.vmap(start, in_axes=(None, 0)))
-    return drawn(origin_of(problem, seed, initial), first + jnp.arange(starts))
+    return _drawn(origin_of(problem, seed, initial), first + jnp.arange(starts))
 
 
 class Origin(eqx.Module):
@@ -331,7 +330,7 @@ def origin_of(problem: Problem, seed: int, initial: Float[np.ndarray, "given dof
             )
         count = len(initial)
         points = np.concatenate([initial, np.tile(initial[:1], (max(0, _ROOM - count), 1, 1))])
-        given = jax.jit(jax.vmap(_given_start, in_axes=(None, 0)))(problem, jnp.asarray(points))
+        given = _given_starts(problem, jnp.asarray(points))
     return Origin(problem, given, jnp.asarray(count), jnp.asarray(seed))
 
 
@@ -340,6 +339,9 @@ def start(origin: Origin, number: Int[Array, ""]) -> Float[Array, " columns"]:
     given = origin.given[jnp.clip(number, 0, len(origin.given) - 1)]
     x0 = _random_start(origin.problem, jax.random.fold_in(jax.random.key(origin.seed), number))
     return jnp.where(number < origin.count, given, x0)
+
+
+_drawn = jax.jit(jax.vmap(start, in_axes=(None, 0)))
 
 
 def solve_starts(origin: Origin, numbers: Int[Array, " chunk"], iterations: int, lanes: int) -> Outcome:
@@ -378,6 +380,9 @@ def _given_start(problem: Problem, phi: Float[Array, "dof 10"]) -> Float[Array, 
     mass = jnp.clip(mass / unit, *problem.mass_box.T)
     com = jnp.clip((com - problem.centre) / length, problem.com_box[..., 0], problem.com_box[..., 1])
     return _interior(problem, mass, com, Sigma / (unit * problem.unit[:, 1] ** 2)[:, None, None], 0.005, None)
+
+
+_given_starts = jax.jit(jax.vmap(_given_start, in_axes=(None, 0)))
 
 
 def _interior(

@@ -14,19 +14,19 @@ _BLOCK = 14
 
 def factor(H: Float[Array, "lanes n n"]) -> Float[Array, "lanes n n"]:
     """What `solve` needs of H; not a number where H is not positive definite."""
-    return jax.lax.platform_dependent(H, cpu=_cholesky, default=_by_blocks)
+    return jax.lax.platform_dependent(H, cpu=cholesky, default=by_blocks)
 
 
 def solve(factor: Float[Array, "lanes n n"], rhs: Float[Array, "lanes n"]) -> Float[Array, "lanes n"]:
     """$H^{-1}$ rhs."""
-    return jax.lax.platform_dependent(factor, rhs, cpu=_substitute, default=_substitute_by_blocks)
+    return jax.lax.platform_dependent(factor, rhs, cpu=substitute, default=substitute_by_blocks)
 
 
-def _cholesky(H):
+def cholesky(H):
     return jax.lax.linalg.cholesky(H, symmetrize_input=False)
 
 
-def _substitute(L, rhs):
+def substitute(L, rhs):
     x = rhs[..., None]
     for transpose in (False, True):
         x = jax.lax.linalg.triangular_solve(L, x, left_side=True, lower=True, transpose_a=transpose)
@@ -39,12 +39,12 @@ def _ranges(n: int) -> list[tuple[slice, slice]]:
     return [(slice(i, min(i + _BLOCK, n)), slice(min(i + _BLOCK, n), n)) for i in starts]
 
 
-def _by_blocks(H):
+def by_blocks(H):
     """The Cholesky factor, but for the blocks on the diagonal: those are inverted."""
     columns, rest = [], H
     for here, _ in _ranges(H.shape[1]):
         w = here.stop - here.start
-        L = _cholesky(rest[:, :w, :w])
+        L = cholesky(rest[:, :w, :w])
         unit = jnp.broadcast_to(jnp.eye(w, dtype=H.dtype), L.shape)
         inverse = jax.lax.linalg.triangular_solve(L, unit, left_side=True, lower=True)
         below = rest[:, w:, :w] @ jnp.swapaxes(inverse, 1, 2)
@@ -53,7 +53,7 @@ def _by_blocks(H):
     return jnp.concatenate(columns, 2)
 
 
-def _substitute_by_blocks(factor, rhs):
+def substitute_by_blocks(factor, rhs):
     blocks = [(here, factor[:, here, here], factor[:, below, here]) for here, below in _ranges(rhs.shape[1])]
     y = []
     for here, inverse, below in blocks:

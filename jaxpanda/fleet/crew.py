@@ -187,7 +187,7 @@ def _cluster(workers: int | None, address: str | None) -> Iterator[tuple[Any, in
     """Ray, connected, and how many workers there are to be."""
     if address:  # Ray would tell of every second that it waits for an answer, and wait for minutes
         os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
-        _require_answer(address)
+        require_answer(address)
     api = ray()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "CRITICAL"}
@@ -214,7 +214,7 @@ def _cluster(workers: int | None, address: str | None) -> Iterator[tuple[Any, in
                 api.shutdown()
 
 
-def _require_answer(address: str) -> None:
+def require_answer(address: str) -> None:
     """Refuse an address of the form host:port where nothing listens."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if address == "auto" or "://" in address.removeprefix("ray://"):
