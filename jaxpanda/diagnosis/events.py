@@ -12,7 +12,7 @@ from ..effects.contact import ExternalContact
 from ..effects.drive import TorqueRipple
 from ..effects.load import EVER, PayloadChange
 from ..effects.unknown import SIGN_WIDTH, UnknownAt
-from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes, log_mean_exp
+from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, levelled, log_bayes, log_mean_exp
 from .host import parallel
 from .problem import Problem
 
@@ -260,7 +260,7 @@ def _turned_back(
     r"""$L^\top x$ with L what makes slow errors level, but for where it begins."""
     if not noise.has_slow(joint):
         return x
-    return noise.levelled(x[::-1], joint, np.zeros((1, *x.shape[1:])))[0][::-1]
+    return levelled(x[::-1], noise.slow[joint], np.zeros((1, *x.shape[1:])))[0][::-1]  # pyright: ignore
 
 
 def _passed(noise: Noise, joint: int, bins: int, count: int) -> Float[np.ndarray, " edges"]:
@@ -268,7 +268,7 @@ def _passed(noise: Noise, joint: int, bins: int, count: int) -> Float[np.ndarray
     if not noise.has_slow(joint):
         return np.ones(count + 1)
     lasts = np.arange(1, count + 1) * bins
-    step, _ = noise.levelled(np.ones(2 * count * bins), joint, np.zeros(1))
+    step, _ = levelled(np.ones(2 * count * bins), noise.slow[joint], np.zeros(1))  # pyright: ignore
     within = np.cumsum(step**2)[lasts - 1]  # of a force that ends, the same again with its sign
     tails = [np.sum((step[n : n + count * bins] - step[: count * bins]) ** 2) for n in lasts]
     return np.append(1.0, (within + tails) / lasts)

@@ -46,8 +46,6 @@ class Noise:
     innovations, with L the step back; as good as none where they are equal."""
     least: Float[np.ndarray, " dof"] | None = None
     """Deviation of the innovations where nothing is left unexplained; `sigma` may be larger [N m]."""
-    dt: float = 0.01
-    """Between samples [s]."""
 
     def trusted(self, rows: slice, joint: int) -> Float[np.ndarray, " _rows"] | float:
         """Weights of some rows, all recordings one below the other."""
@@ -70,24 +68,8 @@ class Noise:
             return y
         out = np.zeros_like(y)
         for rows in stretches(counts):
-            past = self.before(y[rows], joint)
-            out[rows], _ = self.levelled(y[rows], joint, past)
+            out[rows], _ = levelled(y[rows], self.slow[joint])  # pyright: ignore
         return out
-
-    def before(self, y: Float[np.ndarray, "_time ..."], joint: int) -> Float[np.ndarray, "1 ..."]:
-        """State of the filter where a stretch begins, as if as much of what it begins with as is likely to be a
-        slow error had lasted: nothing tells that an error was none before."""
-        p, z = self.slow[joint]  # pyright: ignore
-        variance = (p - z) ** 2 / (1 - p**2)  # of the slow error, beside white noise of unit variance
-        likely = variance / (variance + 1 / min(len(y), BEGINS))
-        return -likely * (p - z) / (1 - z) * y[:BEGINS].mean(0, keepdims=True)
-
-    def levelled(
-        self, y: Float[np.ndarray, "_time ..."], joint: int, past: Float[np.ndarray, "1 ..."]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """`level` of a stretch, or of a part of it, and the filter's state behind it."""
-        p, z = self.slow[joint]  # pyright: ignore
-        return scipy.signal.lfilter([1.0, -p], [1.0, -z], y, axis=0, zi=past)
 
     def has_slow(self, joint: int) -> bool:
         """Whether there is an error slower than the noise in a joint."""
@@ -109,6 +91,26 @@ def stretches(counts: Bool[np.ndarray, " rows"]) -> list[slice]:
     """Where rows count, one after the other."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], counts, [False]])))
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def levelled(
+    y: Float[np.ndarray, "_time ..."],
+    slow: Sequence[float] | Float[np.ndarray, " 2"],
+    past: Float[np.ndarray, "1 ..."] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Innovations of a stretch, in which slow errors weigh as much as any, and the filter's state behind it.
+
+    It begins as if as much of what the stretch begins with as is likely to be a slow error had lasted: nothing
+    tells that an error was none before. `past`: the state before it, where it goes on from another.
+    """
+    pole, zero = slow
+    if past is None:
+        variance = (pole - zero) ** 2 / (
+            1 - pole**2
+        )  # of the slow error, beside white noise of unit variance
+        likely = variance / (variance + 1 / min(len(y), BEGINS))
+        past = -likely * (pole - zero) / (1 - zero) * y[:BEGINS].mean(0, keepdims=True)
+    return scipy.signal.lfilter([1.0, -pole], [1.0, -zero], y, axis=0, zi=past)
 
 
 class OnDemand(Sequence):

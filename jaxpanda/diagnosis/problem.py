@@ -472,7 +472,7 @@ class Problem:
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         off = self._known_unresolved + sum(t.unresolved for t in terms if t.unresolved is not None)
         trust = 1 / np.sqrt(1 + off / np.square(std))
-        return Noise(np.stack(a), np.array(sigma), np.array(std), trust, dt=self.traces[0].motion.dt)
+        return Noise(np.stack(a), np.array(sigma), np.array(std), trust)
 
     @functools.cached_property
     def _known_unresolved(self) -> Float[np.ndarray, "rows dof"]:

@@ -16,7 +16,7 @@ import scipy.linalg
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
-from .evidence import BEGINS, PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes, stretches
+from .evidence import BEGINS, PHYSICAL_SCALES, SCALES, Design, Noise, levelled, log_bayes, stretches
 from .host import parallel
 from .library import Candidates
 from .traces import Trace
@@ -49,8 +49,7 @@ def whitened_slices(
                 np.subtract(x[low:high], y, out=y)
                 y *= weight[low - start : high - start, None]
                 if slow:
-                    past = noise.before(y, joint) if past is None else past
-                    y, past = noise.levelled(y, joint, past)
+                    y, past = levelled(y, noise.slow[joint], past)  # pyright: ignore
                 yield slice(low, high), y
         start = stop
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from .evidence import Design, Noise
+from .evidence import Design, Noise, levelled, stretches
 from .problem import Problem, Term
 
 
@@ -58,7 +58,7 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
     to explain together what none of them is. The same of what is slower than the noise, as errors of a model are:
     of that there are few independent samples, however many were recorded.
     """
-    noise = problem.noise(terms)
+    noise, dt = problem.noise(terms), problem.traces[0].motion.dt
 
     def beside(beyond: Sequence[Beyond]) -> State:
         wider = dataclasses.replace(
@@ -72,7 +72,7 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
     # what a fit leaves depends on the noise it was made in: that of the last model, and none that is unexplained
     starts = (*problem.beyond_noise, (Beyond(),) * problem.dof)
     x = [beside(start).design.x for start in starts]
-    left = [[beyond(noise, j, y) for j, y in enumerate(left_over(problem, noise, terms, c))] for c in x]
+    left = [[beyond(y, dt) for y in left_over(problem, noise, terms, c)] for c in x]
     least = tuple(min(of_joint, key=lambda b: b.left) for of_joint in zip(*left, strict=True))
     problem.beyond_noise[:] = [least]
     return beside(least)
@@ -115,15 +115,15 @@ class Beyond:
     """Twice the nats that a sample of them costs beside that."""
 
 
-def beyond(noise: Noise, joint: int, left: Sequence[Float[np.ndarray, " _time"]]) -> Beyond:
+def beyond(left: Sequence[Float[np.ndarray, " _time"]], dt: float) -> Beyond:
     """The slow error, if what is left is beyond the noise, with which a joint's innovations are smallest; its two
     numbers must be worth it (Schwarz 1978)."""
     best, shape = float(np.log(max(_mean_square(np.concatenate(left)), 1e-300))), (0.0, 0.0)
     count = max(sum(map(np.count_nonzero, left)), 2)
-    for tried in slow_errors(noise.dt) if best > 0 else ():
-        wider = dataclasses.replace(noise, slow=np.tile(tried, (len(noise.sigma), 1)))
-        levelled = [wider.level(part, joint, part != 0) for part in left]
-        found = float(np.log(_mean_square(np.concatenate(levelled)))) + 2 * np.log(count) / count
+    parts = [part[rows] for part in left for rows in stretches(part != 0)]
+    for tried in slow_errors(dt) if best > 0 else ():
+        square = sum(float(np.vdot(y, y)) for y, _ in (levelled(part, tried) for part in parts))
+        found = float(np.log(square / count)) + 2 * np.log(count) / count
         if found < best:
             best, shape = found, tried
     scale = _STEP ** np.floor(max(best, 0.0) / (2 * np.log(_STEP)))
@@ -181,13 +181,13 @@ def evidence(problem: Problem, terms: Sequence[Term], design: Design, noise: Noi
         return design.log_evidence
     plain = dataclasses.replace(noise, sigma=noise.least, slow=None)
     uneven = [j for j in range(problem.dof) if noise.has_slow(j) or noise.sigma[j] > noise.least[j]]
-    gained = 0.0
+    gained, dt = 0.0, problem.traces[0].motion.dt
     for j, parts in zip(uneven, left_over(problem, plain, terms, design.x, uneven), strict=True):
         count = sum(map(np.count_nonzero, parts))
         as_is = np.concatenate([noise.level(part, j, part != 0) for part in parts])
         as_is *= plain.sigma[j] / noise.sigma[j]
         wider = np.log(noise.sigma[j] / plain.sigma[j])
-        gained += 0.5 * float(as_is @ as_is) + count * (wider - 0.5 * beyond(plain, j, parts).left)
+        gained += 0.5 * float(as_is @ as_is) + count * (wider - 0.5 * beyond(parts, dt).left)
     return design.log_evidence + gained
 
 
