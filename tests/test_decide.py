@@ -241,7 +241,8 @@ def test_friction_that_changes_from_one_repeat_to_the_next_is_a_drift_whatever_s
         ((0.8 - 0.01 * t)[:, None] * np.tanh(qd[:, [0]] / 0.01) + 0.3 * qd[:, [0]]) * np.eye(7)[0]
     )
     problem = posed(record(5, warms, seconds=20.0))
-    state = start(problem)
+    steady = CoulombFriction(0, 0.01), ViscousFriction(0)
+    state = with_terms(problem, [problem.term(effect, np.array([1.0])) for effect in steady])
     library = [g for g in problem.library if (g.name, g.joint) == ("friction_drift", 0)]
     (drift,) = grids(problem, state.design, state.noise, library)
     assert is_of_time(problem, state.design, state.noise, refine(problem, state.design, state.noise, drift))
