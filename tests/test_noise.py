@@ -97,12 +97,8 @@ def test_whitening_undoes_what_makes_noise_slow(shape):
     counts = np.arange(2600) != 1300  # a gap
     found = noise.level(slow, 0, counts)
     assert not found[1300].any()
-    np.testing.assert_allclose(found[800:1300], white[800:1300], atol=0.05)
-    assert np.std(found[:1300]) == pytest.approx(1, abs=0.1)
-    lasting = noise.level(np.ones(2600), 0, counts)
-    passed = (1 - pole) / (1 - zero)
-    assert lasting[1299] == pytest.approx(passed, rel=0.01)
-    assert np.all((lasting[counts] > 0.99 * passed) & (lasting[counts] < 1))
+    np.testing.assert_allclose(found[:1300], white[:1300], atol=1e-9)
+    assert noise.level(np.ones(2600), 0, counts)[1299] == pytest.approx((1 - pole) / (1 - zero), rel=0.01)
 
 
 def test_a_slow_error_of_the_model_is_seen_where_there_is_one():

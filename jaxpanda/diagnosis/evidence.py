@@ -27,8 +27,6 @@ SCALES = (1.0, 4.0, 16.0)
 """Sizes of an effect over the noise, per sample, that are expected alike."""
 PHYSICAL_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Sizes over the physically plausible one, where a coefficient has such."""
-BEGINS = 8
-"""Rows that tell what a stretch begins with."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,16 +98,10 @@ def levelled(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Innovations of a stretch, in which slow errors weigh as much as any, and the filter's state behind it.
 
-    It begins as if as much of what the stretch begins with as is likely to be a slow error had lasted: nothing
-    tells that an error was none before. `past`: the state before it, where it goes on from another.
+    `past`: the state before it, where it goes on from another; else errors begin at zero, as where sensors were.
     """
     pole, zero = slow
-    if past is None:
-        variance = (pole - zero) ** 2 / (
-            1 - pole**2
-        )  # of the slow error, beside white noise of unit variance
-        likely = variance / (variance + 1 / min(len(y), BEGINS))
-        past = -likely * (pole - zero) / (1 - zero) * y[:BEGINS].mean(0, keepdims=True)
+    past = np.zeros((1, *y.shape[1:])) if past is None else past
     return scipy.signal.lfilter([1.0, -pole], [1.0, -zero], y, axis=0, zi=past)
 
 

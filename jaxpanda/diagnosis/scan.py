@@ -16,7 +16,7 @@ import scipy.linalg
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
-from .evidence import BEGINS, PHYSICAL_SCALES, SCALES, Design, Noise, levelled, log_bayes, stretches
+from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, levelled, log_bayes, stretches
 from .host import parallel
 from .library import Candidates
 from .traces import Trace
@@ -33,7 +33,7 @@ def whitened_slices(
 ) -> Iterator[tuple[slice, Float[np.ndarray, "_some n"]]]:
     """`Problem.whitened`, a few rows at a time; rows that are zero for want of a past are left out."""
     a, order, slow = noise.a[joint], noise.a.shape[1], noise.has_slow(joint)
-    step = max(BEGINS, _SLICE // max(1, x.shape[1]))
+    step = max(8, _SLICE // max(1, x.shape[1]))
     start = 0
     for trace in traces:
         stop = start + trace.motion.samples
