@@ -119,8 +119,8 @@ def panda(data):
 @pytest.mark.slow
 def test_the_real_panda_s_hysteresis_is_found(panda, data, experiment):
     """The first finding is presliding, J7 among its joints. Where coefficients were not fitted torque is off by
-    no more than an oracle's (1.07 %), and with the laws that a prediction keeps by a quarter more at most; the arm
-    moves as recorded."""
+    no more than an oracle's (1.07 %), with the laws that a prediction keeps by a quarter more; and the arm moves
+    as recorded."""
     found = panda
     assert experiment["oracle"].cross_validated(found, found.state.terms, 5.0)[1] < 1.07
     assert experiment["oracle"].cross_validated(found, found.kept.terms, 5.0)[1] < 1.35
