@@ -27,8 +27,9 @@ SEEN = 0.1
 """Discrepancy over the noise's deviation below which it is left out: it would change nothing."""
 SHAPE = 0.3
 """Deviation of a neighbouring shape's share."""
-TURN = 0.1
-"""Deviation of the share of dry friction that turns in another way."""
+TURN, KNOWN_TURN = 0.1, 0.3
+"""Deviation of the share of dry friction that turns in another way: of a law whose width was fitted, and of the
+user's, which turns as a simulator has it and may do so otherwise altogether."""
 UNRESOLVED, TIMING = 0.03, 0.005
 """Share of its torque by which a law is off in no smooth way, and by how much it may be early or late [s]."""
 _KNOTS = {"q": 5, "qd": 6, "t": 4}
@@ -137,10 +138,10 @@ def of_known(
     samples = [t.motion.samples for t in traces]
     parts = [np.zeros((sum(samples), dof, 0))]
     for j, level in enumerate(np.asarray(arm.frictionloss)):
-        if TURN * level > SEEN * std[j]:
+        if KNOWN_TURN * level > SEEN * std[j]:
             sign = np.concatenate([t.down(t.sign[:, j]) for t in traces])
             law = CoulombFriction
-            off = [TURN * level * (turning(traces, j) - sign[:, None])]
+            off = [KNOWN_TURN * level * (turning(traces, j) - sign[:, None])]
             if law.discrepancy * level > SEEN * std[j]:
                 copies = (_hats(traces, j, channel) for channel in law.varies_with)
                 off += [law.discrepancy * level * sign[:, None] * copy for copy in copies]
