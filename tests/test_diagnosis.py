@@ -561,7 +561,7 @@ def test_a_joint_far_beyond_its_noise_is_unknown_though_nothing_explains_it():
         torque = Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)).load[:, 3]
         held = torque.copy()
         for first in (250, 700, 1250):
-            held[first : first + 130] = torque[first]
+            held[first : first + 180] = torque[first]
         return (held - torque)[:, None] * np.eye(7)[3]
 
     result = diagnose(None, [record(30, frozen)])
