@@ -171,8 +171,11 @@ def _windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposa
             range(problem.dof),
         )
         b, G, H, C = (_cumulated(np.sum([p[k] for p in parts], 0)) for k in range(4))
-        power = np.array([np.trace(p[1].sum((0, 1))) for p in parts])
-        passed = power @ np.stack([_passed(noise, j, bins, count) for j in range(problem.dof)]) / power.sum()
+        passed = None
+        if any(noise.has_slow(j) for j in range(problem.dof)):
+            power = np.array([np.trace(p[1].sum((0, 1))) for p in parts]) + 1e-300
+            each = np.stack([_passed(noise, j, bins, count) for j in range(problem.dof)])
+            passed = power @ each / power.sum()
         if design.factor is not None:
             flat = np.swapaxes(C, 0, 1).reshape(C.shape[1], -1)
             flat = scipy.linalg.solve_triangular(design.factor[0], flat, lower=True, check_finite=False)
@@ -242,16 +245,16 @@ def _binned(
 
 
 def _window_sums(sums, pairs, passed):
-    """b and G in windows; `passed`, of the power of a window of so many bins, is that of a constant force: where
-    one that changes passes more, all of it counts."""
+    """b and G in windows. `passed`, of the power of a window of so many bins, where errors are slow, is that of a
+    constant force: where one that changes passes more, all of it counts."""
     b, G, C = (x[pairs[:, 1]] - x[pairs[:, 0]] for x in sums)
     explained = np.matmul(np.swapaxes(C, 1, 2), C)
+    if passed is None:
+        return b, G - explained
     left = G * passed[pairs[:, 1] - pairs[:, 0], None, None] - explained
-    if passed.min() < 1:
-        unit = 1 / np.sqrt(np.maximum(np.diagonal(G, axis1=1, axis2=2), 1e-300))
-        least = np.linalg.eigvalsh(unit[:, :, None] * left * unit[:, None, :])[:, 0]
-        left = np.where((least < _SOME)[:, None, None], G - explained, left)
-    return b, left
+    unit = 1 / np.sqrt(np.maximum(np.diagonal(G, axis1=1, axis2=2), 1e-300))
+    least = np.linalg.eigvalsh(unit[:, :, None] * left * unit[:, None, :])[:, 0]
+    return b, np.where((least < _SOME)[:, None, None], G - explained, left)
 
 
 def _turned_back(
@@ -260,7 +263,7 @@ def _turned_back(
     r"""$L^\top x$ with L what makes slow errors level, but for where it begins."""
     if not noise.has_slow(joint):
         return x
-    return levelled(x[::-1], noise.slow[joint], np.zeros((1, *x.shape[1:])))[0][::-1]  # pyright: ignore
+    return levelled(x[::-1], noise.slow[joint])[0][::-1]  # pyright: ignore
 
 
 def _passed(noise: Noise, joint: int, bins: int, count: int) -> Float[np.ndarray, " edges"]:
@@ -268,7 +271,7 @@ def _passed(noise: Noise, joint: int, bins: int, count: int) -> Float[np.ndarray
     if not noise.has_slow(joint):
         return np.ones(count + 1)
     lasts = np.arange(1, count + 1) * bins
-    step, _ = levelled(np.ones(2 * count * bins), noise.slow[joint], np.zeros(1))  # pyright: ignore
+    step, _ = levelled(np.ones(2 * count * bins), noise.slow[joint])  # pyright: ignore
     within = np.cumsum(step**2)[lasts - 1]  # of a force that ends, the same again with its sign
     tails = [np.sum((step[n : n + count * bins] - step[: count * bins]) ** 2) for n in lasts]
     return np.append(1.0, (within + tails) / lasts)

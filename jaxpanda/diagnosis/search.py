@@ -20,6 +20,7 @@ from .proposals import by_place, grids, plainer, ranked, with_prior
 from .shapes import evidence_of, first_steps, refine
 from .state import (
     State,
+    beside,
     evidence,
     gains,
     in_noise,
@@ -190,7 +191,8 @@ def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> Sta
     for i in range(len(state.terms)):
         if not _is_new(problem, ("exchange", free), state, (i,)):
             continue
-        own, best = gains(problem, state)[i], instead(problem, state, i, free)[0]
+        found = instead(problem, state, i, free)
+        own, best = next(gained for gained, terms in found if terms[0] is state.terms[i]), found[0]
         if best[0] > own + BETTER:
             if [t.key for t in best[1]] != [state.terms[i].key]:
                 said = ", ".join(map(name, best[1]))
@@ -224,11 +226,8 @@ def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
                 continue
             others = tuple(t for i, t in enumerate(state.terms) if i not in group)
             design = problem.design(others, state.noise)
-            own = (
-                evidence(problem, state.terms, state.design, state.noise)
-                - evidence(problem, others, design, state.noise)
-                + sum(state.terms[i].prior for i in group)
-            )
+            whole = evidence(problem, state.terms, state.design, state.noise)
+            own = whole - beside(problem, state, group, design)
             joints = None
             if all(isinstance(state.terms[i].effect, AbstractJointEffect) for i in group):
                 joints = {j for i in group for j in state.terms[i].effect.joints}
@@ -266,11 +265,7 @@ def instead(problem: Problem, state: State, i: int, free: bool = True) -> list[C
         found += [
             pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts, free))
         ]
-    own = (
-        evidence(problem, state.terms, state.design, state.noise)
-        - evidence(problem, others, rest, state.noise)
-        + term.prior
-    )
+    own = evidence(problem, state.terms, state.design, state.noise) - beside(problem, state, (i,), rest)
     return sorted([(own, (term,)), *found], key=lambda choice: -choice[0])
 
 

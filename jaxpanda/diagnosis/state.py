@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -60,7 +60,7 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
     """
     noise, dt = problem.noise(terms), problem.traces[0].motion.dt
 
-    def beside(beyond: Sequence[Beyond]) -> State:
+    def widened(beyond: Sequence[Beyond]) -> State:
         wider = dataclasses.replace(
             noise,
             sigma=noise.sigma * [b.scale for b in beyond],
@@ -71,11 +71,11 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
 
     # what a fit leaves depends on the noise it was made in: that of the last model, and none that is unexplained
     starts = (*problem.beyond_noise, (Beyond(),) * problem.dof)
-    x = [beside(start).design.x for start in starts]
+    x = [widened(start).design.x for start in starts]
     left = [[beyond(y, dt) for y in left_over(problem, noise, terms, c)] for c in x]
     least = tuple(min(of_joint, key=lambda b: b.left) for of_joint in zip(*left, strict=True))
     problem.beyond_noise[:] = [least]
-    return beside(least)
+    return widened(least)
 
 
 def left_over(
@@ -164,11 +164,15 @@ def without(state: State, i: int) -> Design:
 def gains(problem: Problem, state: State) -> list[float]:
     """By how much each term makes the model likelier, beside the others [nats]."""
     own = evidence(problem, state.terms, state.design, state.noise)
-    rest = [(*state.terms[:i], *state.terms[i + 1 :]) for i in range(len(state.terms))]
-    return [
-        own - evidence(problem, others, without(state, i), state.noise) + t.prior
-        for i, (t, others) in enumerate(zip(state.terms, rest, strict=True))
-    ]
+    return [own - beside(problem, state, (i,), without(state, i)) for i in range(len(state.terms))]
+
+
+def beside(problem: Problem, state: State, which: Collection[int], rest: Design) -> float:
+    """Log evidence of the model without some of its terms, `rest`, less their priors: what the whole must exceed
+    for them to be worth it."""
+    others = [t for i, t in enumerate(state.terms) if i not in which]
+    paid = sum(state.terms[i].prior for i in which)
+    return evidence(problem, others, rest, state.noise) - paid
 
 
 def evidence(problem: Problem, terms: Sequence[Term], design: Design, noise: Noise) -> float:

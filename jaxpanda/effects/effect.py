@@ -69,6 +69,10 @@ class Resistance(eqx.Module):
     """Hidden state after the step."""
 
 
+COMMON = -9.0
+"""Prior of what nearly every arm has: friction of its gears, offsets of its torque sensors."""
+
+
 class AbstractEffect(eqx.Module):
     """Physics that a rigid-body model leaves out; the class is one effect, an instance one shape of it."""
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ..arm import Arm
 from .effect import (
+    COMMON,
     AbstractDryFriction,
     AbstractEffect,
     AbstractInstantEffect,
@@ -25,8 +26,6 @@ from .motion import Channels, Joint
 _WIDTH = Shape("v0", "rad/s", 1e-3, 0.3)
 
 
-COMMON = -9.0
-"""Prior of friction that every gear has."""
 CORRECTED = -10.0
 """Prior of a number of the user's model that is wrong: many are round, and nobody measured them."""
 PROPORTIONAL = 1.25
