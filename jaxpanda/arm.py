@@ -101,21 +101,21 @@ class Arm(eqx.Module):
             raise ValueError("joint_names and link_names must be as many texts as there are joints")
         shapes = {"R": (dof, 3, 3), "p": (dof, 3), "prismatic": (dof,), "gravity": (3,)}
         for name, shape in shapes.items():
-            values = np.asarray(document["chain"][name])
-            if values.shape != shape or values.dtype == object or not np.isfinite(values).all():
+            values = np.asarray(document["chain"][name], float)
+            if values.shape != shape or not np.isfinite(values).all():
                 raise ValueError(f"chain: {name} must hold {' x '.join(map(str, shape))} numbers")
         for name, shape in {"lumped": (dof, 10), **dict.fromkeys(FRICTION_LAW, (dof,))}.items():
             if document.get(name) is not None and np.asarray(document[name], float).shape != shape:
                 raise ValueError(f"{name} must hold {' x '.join(map(str, shape))} numbers")
         R, p, prismatic, gravity = (document["chain"][name] for name in _CHAIN)
-        chain = Chain(jnp.asarray(R), jnp.asarray(p), jnp.asarray(prismatic, bool), jnp.asarray(gravity))
+        chain = Chain(numbers(R), numbers(p), jnp.asarray(prismatic, bool), numbers(gravity))
         return cls(
             chain,
-            **{name: jnp.asarray(_unlisted(document[name], name)) for name in NUMBERS},
+            **{name: numbers(_unlisted(document[name], name)) for name in NUMBERS},
             joint_names=names[0],
             link_names=names[1],
             name=str(document["name"]),
-            **{name: jnp.asarray(document[name]) for name in _OPTIONAL if document.get(name) is not None},  # pyright: ignore[reportArgumentType]
+            **{name: numbers(document[name]) for name in _OPTIONAL if document.get(name) is not None},  # pyright: ignore[reportArgumentType]
         )
 
     def unit(self, turning: str, joint: int | None = None) -> str:
@@ -145,6 +145,11 @@ class Arm(eqx.Module):
 
 
 _CHAIN = ("R", "p", "prismatic", "gravity")
+
+
+def numbers(values: Any) -> Array:
+    """The numbers of a JSON document as an array; what is none raises TypeError or ValueError."""
+    return jnp.asarray(np.asarray(values, float))
 
 
 def _listed(values: Array) -> list[Any]:

@@ -14,7 +14,7 @@ from jaxpanda_kernels import Chain
 from jaxtyping import Array, Float
 
 from . import files
-from .arm import FRICTION_LAW, NUMBERS, Arm
+from .arm import FRICTION_LAW, NUMBERS, Arm, numbers
 from .effects import (
     AbstractEffect,
     AbstractJointEffect,
@@ -230,11 +230,11 @@ class Corrected(eqx.Module):
         found = [effect_from_json(e, classes) for e in document["effects"]]
         return cls(
             Arm.from_json(document["arm"]),
-            jnp.asarray(document["change"]),
-            jnp.asarray(document["damping_change"]),
-            jnp.asarray(document["frictionloss_change"]),
+            numbers(document["change"]),
+            numbers(document["damping_change"]),
+            numbers(document["frictionloss_change"]),
             tuple(found),
-            tuple(jnp.asarray(e["coefficients"], float) for e in document["effects"]),
+            tuple(numbers(e["coefficients"]) for e in document["effects"]),
             None if document.get("turning") is None else float(document["turning"]),
         )
 

@@ -124,11 +124,8 @@ def test_a_ripple_of_which_little_is_seen_is_no_spring_with_a_ripple_on_it():
     assert [(f.effect, f.joints) for f in found.findings] == [("torque_ripple", (3,))]
 
 
-_STRONG = "beside slow errors a law that holds both, or a part of it again, stands in some strong cases"
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [pytest.param(1.0, marks=pytest.mark.xfail(reason=_STRONG)), 0.08])
+@pytest.mark.parametrize("size", [1.0, 0.08])
 def test_friction_and_damping_together_are_no_stribeck_friction(size):
     """Laws that hold both had more evidence than either alone, and one of them was named at 0.9."""
     rubs = lambda t, q, qd, qdd: size * np.eye(7)[3] * (np.tanh(qd[:, [3]] / 0.004) + 1.5 * qd[:, [3]])
@@ -161,17 +158,17 @@ def test_friction_with_a_power_of_the_speed_is_found(exponent):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="a viscous friction of 22 nats beside one of 81,000 that holds it")
-def test_damping_that_differs_between_the_directions_with_the_level_is_one_finding():
+def test_damping_that_differs_between_the_directions_is_found_with_what_is_common_to_both():
     """Its damping, common to both directions, was left out, and a third of the torque at speed with it."""
 
     def rubs(t, q, qd, qdd):
         v = qd[:, [3]]
         return np.eye(7)[3] * (1 + 0.4 * np.sign(v)) * (np.tanh(v / 0.004) + 0.6 * v)
 
-    (found,) = diagnose(None, [record(20, rubs), record(21, rubs)], knowledge="exact").findings
-    assert (found.effect, found.joints) == ("asymmetric_friction", (3,))
-    number = {p["name"]: p["value"] for p in found.parameters}
+    found = diagnose(None, [record(20, rubs), record(21, rubs)], knowledge="exact").findings
+    assert (found[0].effect, found[0].joints) == ("asymmetric_friction", (3,))
+    assert {(f.effect, f.joints) for f in found[1:]} <= {("viscous_friction", (3,))}
+    number = {p["name"]: p["value"] for f in found for p in f.parameters}
     expected = {"coulomb": 1.0, "coulomb_asymmetry": 0.4, "damping": 0.6, "damping_asymmetry": 0.24}
     assert {n: number[n] for n in expected} == pytest.approx(expected, rel=0.1)
 

@@ -14,6 +14,7 @@ from jaxpanda.diagnosis.traces import held_sign, prepare
 from jaxpanda.effects.friction import FrictionDrift, LoadDependentFriction
 from jaxpanda.effects.motion import Channels
 from jaxpanda.effects.sensing import TorqueDrift
+from jaxpanda.errors import InputError
 
 RATE, NOISE = 500.0, 0.05
 
@@ -197,3 +198,16 @@ def test_known_friction_turns_as_mujoco_has_it_turn(joint, before, tmp_path):
     turning = np.mean(np.abs(share[:, 1]) < 0.99)
     assert 0.02 < turning < 0.98
     np.testing.assert_allclose(np.asarray(arm.frictionloss) * share, friction, atol=1e-5)
+
+
+def test_friction_of_an_arm_that_has_no_mass_is_refused():
+    arm = dataclasses.replace(Arm.panda(), standard=jnp.zeros((7, 10)), armature=jnp.zeros(7))
+    with pytest.raises(InputError, match="mass matrix is singular"):
+        held_sign(arm, np.zeros((3, 7)), np.zeros((3, 7)), np.zeros(7))
+
+
+@pytest.mark.parametrize("wrong", [["a"] * 7, [{"a": 1}] * 7, {"a": 1}])
+def test_what_are_no_numbers_in_a_saved_arm_is_refused(wrong):
+    """Texts of one letter were taken for a deprecated type of numpy's."""
+    with pytest.raises((TypeError, ValueError)):
+        Arm.from_json({**Arm.panda().to_json(), "damping": wrong})

@@ -55,8 +55,8 @@ def findings(problem: Problem, state: State, laws: State, lost: Sequence[bool]) 
     lowest = {"lowest": problem.traces[0].cutoff} if out else {}
     halted = stuck(problem, state.noise.std)
     unnamed = hum([t.signals for t in problem.traces], problem.active, state.noise.std, **lowest)
-    unnamed = unnamed or (None if out else standing_off(problem, state))
-    return sorted(out, key=lambda f: -f.evidence) + [f for f in (halted, unnamed) if f is not None]
+    out = sorted(out, key=lambda f: -f.evidence) + [f for f in (halted, unnamed) if f is not None]
+    return out + standing_off(problem, state, {j for f in out for j in f.joints})
 
 
 def numbers(

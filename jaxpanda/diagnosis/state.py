@@ -89,18 +89,17 @@ def left_over(
     row does not count."""
     out = []
     for j in range(problem.dof) if joints is None else joints:
-        parts = zip(
-            problem.residual,
-            problem.nuisance,
-            *(t.at_joint(j) for t in terms),
-            strict=True,
-        )
-        of_joint = []
-        for r, (residual, nuisance, *columns) in enumerate(parts):
-            left = residual[:, j] - np.concatenate([nuisance[:, j], *columns], 1) @ x
-            of_joint.append(noise.innovations(left, j) * problem.weights(noise, r, j))
-        out.append(of_joint)
+        left = enumerate(misfit(problem, terms, x, j))
+        out.append([noise.innovations(y, j) * problem.weights(noise, r, j) for r, y in left])
     return out
+
+
+def misfit(
+    problem: Problem, terms: Sequence[Term], x: Float[np.ndarray, " n"], joint: int
+) -> list[Float[np.ndarray, " _time"]]:
+    """What a model leaves of a joint's torque in each recording [N m]."""
+    parts = zip(problem.residual, problem.nuisance, *(t.at_joint(joint) for t in terms), strict=True)
+    return [r[:, joint] - np.concatenate([n[:, joint], *columns], 1) @ x for r, n, *columns in parts]
 
 
 @dataclasses.dataclass(frozen=True)

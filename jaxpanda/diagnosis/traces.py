@@ -18,6 +18,7 @@ from jaxtyping import Float
 from .. import signals as signals_
 from ..arm import Arm
 from ..effects import Channels, Motion, Stretches, masses
+from ..errors import InputError
 from ..mjcf import SOLIMP, SOLREF
 from ..recordings import Recording
 
@@ -377,7 +378,13 @@ def held_sign(
         impedance, most = SOLIMP[:2]
         b = np.full(arm.dof, 2 / (most * SOLREF[0]))
         M = masses(arm, np.zeros((1, arm.dof)))[0]
-        R = (1 - impedance) / impedance * np.maximum(np.diag(np.linalg.inv(M)), 1e-9)
+        try:
+            mobility = np.diag(np.linalg.inv(M))
+        except np.linalg.LinAlgError:
+            raise InputError(
+                "the model's mass matrix is singular: a joint moves nothing; give its links mass or armature"
+            ) from None
+        R = (1 - impedance) / impedance * np.maximum(mobility, 1e-9)
     width = np.maximum(np.asarray(arm.frictionloss) * R, b * np.maximum(least, 1e-6))
     return np.clip((b * qd + qdd) / np.maximum(width, 1e-12), -1.0, 1.0)
 

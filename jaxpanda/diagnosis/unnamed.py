@@ -9,7 +9,7 @@ r"""What no effect of the catalogue explains, and no free curve either.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import scipy.ndimage
@@ -20,7 +20,7 @@ from ..signals import Signals, white_noise
 from .calibration import SUREST
 from .finding import Finding, joined
 from .problem import Problem
-from .state import State, mean_squares
+from .state import State, mean_squares, misfit
 
 BEYOND = 4.0
 """Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""
@@ -38,16 +38,21 @@ _LOBE = 3
 """Bins on either side that a line takes under the window."""
 
 
-def standing_off(problem: Problem, state: State) -> Finding | None:
-    """The joint that is farthest beyond its noise where nothing was found, and when it is; None if none is."""
+def standing_off(problem: Problem, state: State, named: Collection[int]) -> list[Finding]:
+    """For each joint beyond its noise in which nothing was found, when it is.
+
+    `named`: joints of what was found.
+    """
     joints = range(problem.dof)
     counts = [
         np.stack([problem.weights(state.noise, r, j) for j in joints], 1) for r in range(len(problem.traces))
     ]
-    parts = zip(problem.residual, problem.nuisance, problem.traces, counts, problem.active, strict=True)
-    x = state.design.x[: problem.nuisance[0].shape[2]].copy()
+    x = state.design.x.copy()
     x[problem.shaken] = 0.0
-    suspect = [(r - n @ x, trace, count) for r, n, trace, count, on in parts if on]
+    of_joints = [misfit(problem, state.terms, x, j) for j in joints]
+    left = [np.stack(columns, 1) for columns in zip(*of_joints, strict=True)]
+    parts = zip(left, problem.traces, counts, problem.active, strict=True)
+    suspect = [(e, trace, count) for e, trace, count, on in parts if on]
     left = np.concatenate([e for e, _, _ in suspect])
     weights = np.concatenate([count for _, _, count in suspect])
     # what stands off now and then passes for noise of a joint; its torque from sample to sample shows less
@@ -61,34 +66,41 @@ def standing_off(problem: Problem, state: State) -> Finding | None:
     beyond = np.minimum(
         beyond, mean_squares(problem, problem.noise(state.terms), state.terms, state.design.x)
     )
-    joint = int(np.argmax(beyond))
-    if beyond[joint] < BEYOND:
-        return None
-    seen = []
-    for e, trace, count in suspect:
-        power = (e[:, joint] / noise[joint] * count[:, joint]) ** 2 / weight[joint]
-        power = scipy.ndimage.uniform_filter1d(power, max(1, round(_SMOOTHED / trace.motion.dt)))
-        seen.append((float(power[power > BEYOND].sum()), trace, trace.motion.time[power > BEYOND]))
-    _, trace, times = max(seen, key=lambda one: one[0])
-    when = joined([(float(t), float(t)) for t in times], _PAUSE)
-    whole = not when or sum(b - a for a, b in when) > 0.5 * float(np.ptp(trace.motion.time))
-    rms = np.sqrt(np.mean(left**2, 0)) * (np.arange(problem.dof) == joint)
-    return Finding(
-        effect="unknown",
-        joints=(joint,),
-        recordings=(trace.name,),
-        intervals=None if whole else when,
-        confidence=float(1 - 1 / beyond[joint]),
-        alternatives=(),
-        equation="no law was found",
-        parameters=(),
-        rms_torque=rms,
-        evidence=float(0.5 * np.sum(weights[:, joint] > 0) * (beyond[joint] - 1 - np.log(beyond[joint]))),
-        summary=f"Joint {joint + 1} is {np.sqrt(beyond[joint]):.1f} times its noise off the simulation"
-        + ("" if whole else f" at times, in {trace.name} first from {when[0][0]:.2f} s to {when[0][1]:.2f} s")
-        + "; neither a named effect nor a free curve explains it.",
-        terms=(),
-    )
+    rms = np.sqrt(np.mean(left**2, 0))
+    out = []
+    for joint in set(np.flatnonzero(beyond >= BEYOND).tolist()) - set(named):
+        seen = []
+        for e, trace, count in suspect:
+            power = (e[:, joint] / noise[joint] * count[:, joint]) ** 2 / weight[joint]
+            power = scipy.ndimage.uniform_filter1d(power, max(1, round(_SMOOTHED / trace.motion.dt)))
+            seen.append((float(power[power > BEYOND].sum()), trace, trace.motion.time[power > BEYOND]))
+        _, trace, times = max(seen, key=lambda one: one[0])
+        when = joined([(float(t), float(t)) for t in times], _PAUSE)
+        whole = not when or sum(b - a for a, b in when) > 0.5 * float(np.ptp(trace.motion.time))
+        count = np.sum(weights[:, joint] > 0)
+        out.append(
+            Finding(
+                effect="unknown",
+                joints=(joint,),
+                recordings=(trace.name,),
+                intervals=None if whole else when,
+                confidence=float(1 - 1 / beyond[joint]),
+                alternatives=(),
+                equation="no law was found",
+                parameters=(),
+                rms_torque=rms * (np.arange(problem.dof) == joint),
+                evidence=float(0.5 * count * (beyond[joint] - 1 - np.log(beyond[joint]))),
+                summary=f"Joint {joint + 1} is {np.sqrt(beyond[joint]):.1f} times its noise off the simulation"
+                + (
+                    ""
+                    if whole
+                    else f" at times, in {trace.name} first from {when[0][0]:.2f} s to {when[0][1]:.2f} s"
+                )
+                + "; neither a named effect nor a free curve explains it.",
+                terms=(),
+            )
+        )
+    return out
 
 
 def stuck(problem: Problem, std: Float[np.ndarray, " dof"]) -> Finding | None:

@@ -302,7 +302,8 @@ class LoadDependentFriction(AbstractDryFriction):
 
     @property
     def held(self) -> tuple[type[AbstractEffect], ...]:
-        return (CoulombFriction,) if "coulomb" in self.form.split() else ()
+        of_words = {"coulomb": CoulombFriction, "viscous": ViscousFriction}
+        return tuple(of_words[w] for w in self.form.split() if w in of_words)
 
     def variants(self, arm: Arm) -> Sequence["LoadDependentFriction"]:
         forms = ("directed", "coulomb directed", "viscous", "directed viscous")
