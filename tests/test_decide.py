@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import record
 
-from jaxpanda import Arm
+from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.credible import is_of_time
 from jaxpanda.diagnosis.decide import findings
@@ -21,7 +21,7 @@ from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.proposals import grids
 from jaxpanda.diagnosis.search import climb, search
 from jaxpanda.diagnosis.shapes import refine
-from jaxpanda.diagnosis.state import likelier, places, start, with_terms
+from jaxpanda.diagnosis.state import likelier, misfit, places, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.drive import JointSpring
@@ -58,6 +58,24 @@ def test_crosstalk_carries_what_its_source_is_missing_too(tmp_path):
     assert later.tau is not None
     error = np.sqrt(np.mean((predict(tmp_path, motion) - later.tau)[100:-100, 3] ** 2))
     assert error < 0.06  # the noise is 0.05
+
+
+def test_a_law_does_not_do_what_it_likes_at_joints_that_rest():
+    """A link that one moving joint showed to be wrong put 35 N m into the others, which friction held."""
+    t = np.arange(0, 8, 0.01)
+    q = np.tile([0.1, 0.4, -0.2, -1.8, 0.0, 1.6, 0.3], (len(t), 1))
+    q[:, 4] += 0.4 * np.sin(2 * np.pi * (0.2 * t + 0.05 * t**2))
+    qd, qdd = np.gradient(q, t, axis=0), np.gradient(np.gradient(q, t, axis=0), t, axis=0)
+    motion, rng = Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)), np.random.default_rng(0)
+    tau = motion.load + 0.05 * rng.standard_normal(q.shape) + 0.3 * (1 - np.eye(7)[4])
+    tau[:, 4] += 0.2 * qdd[:, 4] + 0.4 * np.sin(q[:, 4])
+    problem = posed(Recording("chirp.csv", t, q, tau=tau))
+    library = [g for g in problem.library if (g.name, g.effects[0].joints) == ("inertial_parameters", (5,))]
+    (link,) = grids(problem, start(problem).design, start(problem).noise, library)
+    state = with_terms(problem, [problem.term(link.effect, link.deviation)])
+    left = [np.sqrt(np.mean(misfit(problem, state.terms, state.design.x, j)[0] ** 2)) for j in range(7)]
+    assert left[4] < 0.1
+    assert max(left) < 0.6  # twice what they are off anyway
 
 
 def test_a_spring_that_stiffens_is_a_spring_wherever_the_joint_moves():

@@ -29,6 +29,8 @@ _MEMORY = 1 << 28
 """Bytes of columns of shapes off the grid that are kept."""
 _UNHEARD = 1e9
 """Innovations of a joint that no recording tells anything about [N m]."""
+_PICKED = 64
+"""Rows of a joint at rest that are looked at."""
 FOLDS, ROUNDS = 5, 5
 """Blocks of the cross-validation, and how often they come in a recording for what changes with time."""
 
@@ -352,6 +354,12 @@ class Problem:
                 for right in acting[: i + 1]:
                     H[place[left], place[right]] += here.product(left, right)
         H = np.tril(H) + np.tril(H, -1).T
+        for joint, rows, size in self._resting:
+            at_rest = lambda parts, rows=rows, size=size: np.concatenate(parts)[rows] / size
+            nuisance, residual = ([x[:, joint] for x in parts] for parts in (self.nuisance, self.residual))
+            A = np.concatenate([at_rest(nuisance), *(at_rest(t.at_joint(joint)) for t in terms)], 1)
+            H += A.T @ A
+            g += A.T @ at_rest(residual)
         precision = np.concatenate([np.ones(counts[0]), *(t.precision for t in terms)])
         parts = [[(at, x) for key, at in place.items() if (x := h.rows(key)) is not None] for h in joints]
 
@@ -363,6 +371,21 @@ class Problem:
 
         columns = OnDemand(joined, self.dof)
         return Design(columns, [h.residual for h in joints], precision, (H, g), terms)
+
+    @functools.cached_property
+    def _resting(self) -> list[tuple[int, np.ndarray, float]]:
+        """Joints that no recording tells noise of, as where friction holds them, some of their rows, and the
+        deviation of the torque in each [N m], which counts as often as the user's model is off there: their
+        torque together tells as much as one sample. Without it models differ there in ways that nothing bounds.
+        """
+        out = []
+        rows = np.unique(np.linspace(0, self.rows[-1].stop - 1, _PICKED).astype(int))
+        for joint in range(self.dof):
+            if not self.saturation.tells(joint):
+                off = np.concatenate([r[:, joint] for r in self.residual])[rows]
+                size = float(np.sqrt(np.mean(off**2)))
+                out.append((joint, rows, max(size, QUIETEST) * np.sqrt(len(rows))))
+        return out
 
     @functools.cached_property
     def folds(self) -> list[tuple[np.ndarray, np.ndarray]]:
