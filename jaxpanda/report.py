@@ -19,6 +19,8 @@ _PIPED_WIDTH = 200
 """Columns of text that goes to a file or a pipe; a terminal knows its own width."""
 
 
+_HALF, _WIDE = 5.0, 8.0
+"""Width up to which a figure takes half of a wide page, and beyond which a phone shows a part of it [inches]."""
 _NARROW = 28
 """Width from which a column of a table may be broken into lines on a terminal."""
 
@@ -32,16 +34,20 @@ class Table:
     caption: str = ""
     shades: Sequence[Sequence[float | None]] | None = None
     """On a page, how strongly each cell is coloured: 0 to 1, or below 0 for the other colour."""
+    more: str = ""
+    less: str = ""
+    """What the one colour means, and the other: the legend."""
+    folded: bool = False
+    """On a page, whether its caption stands alone until it is opened."""
 
     def style(self, row: int, column: int) -> str:
-        """CSS of a cell."""
+        """CSS of a cell, in the page's colours."""
         shade = None if self.shades is None else self.shades[row][column]
         if not shade:
             return ""
-        colour = "20, 110, 180" if shade > 0 else "190, 120, 30"
         strength = min(abs(shade), 1.0)
         ink = "; color: #fff" if strength > 0.65 else ""
-        return f"background: rgba({colour}, {0.85 * strength:.2f}){ink}"
+        return f"background: rgba(var(--{'more' if shade > 0 else 'less'}), {0.85 * strength:.2f}){ink}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +66,7 @@ class Figure:
     draw: Callable
     caption: str
     size: tuple[float, float] = (9.0, 5.0)
+    """[inches]; two of five inches or less stand side by side on a wide page."""
     layout: str | None = "constrained"
     """Of matplotlib; None, which takes half the time, where `draw` leaves room itself."""
 
@@ -164,9 +171,16 @@ def to_html(title: str, sections: Sequence[Section], path: str | Path) -> None:
         loader=jinja2.PackageLoader("jaxpanda"), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     drawn = [
-        (section, [(_svg(figure), figure.caption) for figure in section.figures]) for section in sections
+        (section, [(_svg(figure), figure.caption, _breadth(figure)) for figure in section.figures])
+        for section in sections
     ]
     write_text(path, pages.get_template("report.html.j2").render(title=title, sections=drawn))
+
+
+def _breadth(figure: Figure) -> str:
+    """How a page has a figure: half as wide, as wide as the screen, or on a phone wider than that."""
+    width = figure.size[0]
+    return "half" if width <= _HALF else "wide" if width > _WIDE else "whole"
 
 
 def _svg(figure: Figure) -> str:
@@ -191,6 +205,11 @@ def _svg(figure: Figure) -> str:
         for text in canvas.findobj(Text):
             text.set_text("\n".join(map(printable, text.get_text().split("\n"))))  # pyright: ignore
         buffer = io.StringIO()
-        canvas.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+        canvas.savefig(
+            buffer,
+            format="svg",
+            transparent=True,
+            metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")),
+        )
     text = buffer.getvalue()
     return text[text.index("<svg") :]

@@ -120,7 +120,10 @@ def test_the_page_stands_alone_and_escapes_what_users_named(found, tmp_path):
     assert all(url.startswith("http://www.w3.org/") for url in outside)
     for part in ("1. stribeck friction at joint 5", "95 % interval", "What would have shown", "Every effect"):
         assert part in text
-    assert text.count("<svg") >= 2  # of the finding, and of the recording
+    assert text.count("<svg") >= 4  # all joints before and after, two of the finding, and the recording
+    assert "prefers-color-scheme: dark" in text
+    assert "times likelier with it than without" in text
+    assert "nats" not in text
 
 
 @pytest.mark.slow

@@ -22,6 +22,14 @@ from .unnamed import sines
 _POINTS = 900
 """Points of a cloud, and stretches of a curve, that a figure draws."""
 _TONES = {"consistent": "good", "explained": "bad", "partly_explained": "unsure", "unexplained": "unsure"}
+_WORSE = 1.05
+"""Factor of an error from which it is told as worse."""
+_CHANGED = 0.005
+"""Share of a number of the model by which it must have changed to be told."""
+_MANY = 12
+"""Rows of a finding's parameters from which they are folded away, as the knots of a curve."""
+_TRIED, _REJECTED = 5.0, 12
+"""Gain from which an effect that was left out is told [nats], and how many are."""
 _BEFORE, _AFTER, _FIT = "#e08a1e", "#1f6fb2", "#b3202a"
 
 
@@ -65,8 +73,52 @@ def _verdict(found: Diagnosis, document: Mapping[str, Any], names: Sequence[str]
         row: list[float | None] = [None]
         row += [-_faded(np.asarray(v)[j] / floor[j] - 1.15, 10.0) for v in list(columns.values())[:4]]
         shades.append([*row, None])
-    shaded = Table(table.columns, table.rows, table.caption, shades)
-    return Section("Verdict", sentences, [shaded], tone=_TONES[found.verdict])
+    rows = [list(row) for row in table.rows]
+    for before, after in ((1, 2), (3, 4)):
+        told = list(columns.values())
+        for j, cells in enumerate(rows):
+            if told[after - 1][j] > _WORSE * max(told[before - 1][j], floor[j]):
+                cells[after] += " ▲"
+    worse = any("▲" in cell for row in rows for cell in row)
+    caption = table.caption + (" ▲ worse than before." if worse else "")
+    shaded = Table(table.columns, rows, caption, shades, less="beyond the noise")
+    return Section(
+        "Verdict",
+        sentences,
+        [shaded],
+        [_bars(found, columns, names)],
+        tone=_TONES[found.verdict],
+        figures_first=True,
+    )
+
+
+def _bars(found: Diagnosis, columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
+    """What is left of each joint's torque by either model, over its noise, where it was not fitted."""
+    floor = np.maximum(np.asarray(columns["noise floor"]), 1e-12)
+    pairs = (
+        ("your simulation", "held out, before", _BEFORE),
+        ("corrected, on data that it was not fitted to", "held out, after", _AFTER),
+    )
+
+    def draw(canvas: Any) -> None:
+        axis = canvas.subplots()
+        canvas.subplots_adjust(left=0.07, right=0.995, bottom=0.12, top=0.97)
+        for k, (label, column, colour) in enumerate(pairs):
+            axis.bar(
+                np.arange(len(names)) + 0.4 * (k - 0.5),
+                np.asarray(columns[column]) / floor,
+                0.38,
+                color=colour,
+                label=label,
+            )
+        axis.axhline(1.0, color="0.3", linewidth=1.0, linestyle="--", label="noise")
+        axis.set_xticks(range(len(names)), [_short(name, 14) for name in names])
+        axis.set_ylabel("torque error over noise")
+        axis.set_yscale("log")
+        axis.yaxis.set_major_formatter(lambda v, _: f"{v:g}")
+        axis.legend(loc="upper left", fontsize=7)
+
+    return Figure(draw, "Torque error of each joint, before and after", (7.6, 2.6), None)
 
 
 def _weakest(found: Diagnosis) -> str:
@@ -84,7 +136,8 @@ def _weakest(found: Diagnosis) -> str:
 def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -> Section:
     sentences = [one.summary, f"Equation: {one.equation}."]
     sentences.append(
-        f"Confidence {one.confidence:.2f}; evidence over the model without it {one.evidence:.0f} nats."
+        f"Confidence {one.confidence:.2f} that this is its name; the recordings are {_odds(one.evidence)} times"
+        " likelier with it than without."
     )
     if one.intervals:
         spans = ", ".join(f"{a:.2f} to {b:.2f} s" for a, b in one.intervals)
@@ -96,7 +149,10 @@ def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -
         interval = " … ".join(ends) if p["std"] else "–"
         rows.append([p["name"], str(p["joint"] or "-"), number(p["value"]), interval, p["unit"]])
     if rows:
-        tables.append(Table(["parameter", "joint", "value", "95 % interval", "unit"], rows))
+        many = len(rows) > _MANY
+        caption = f"Parameters, {len(rows)} rows" if many else ""
+        heads = ["parameter", "joint", "value", "95 % interval", "unit"]
+        tables.append(Table(heads, rows, caption, folded=many))
     felt = ["rms", *(number(float(v), 3) for v in one.rms_torque)]
     tables.append(Table(["", *names], [felt], f"Torque that it explains [{found.problem.arm.unit('N·m')}]"))
     if one.alternatives:
@@ -107,7 +163,7 @@ def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -
         f"{place + 1}. {_plain(one.effect)}" + _at(one.joints, len(names)),
         sentences,
         tables,
-        [_picture(found, one, names)],
+        _pictures(found, one, names),
         figures_first=True,
     )
 
@@ -127,7 +183,12 @@ def _faded(value: float, strong: float) -> float:
     return float(np.clip(np.log1p(max(value, 0.0)) / np.log1p(strong), 0.0, 1.0))
 
 
-def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
+def _odds(nats: float) -> str:
+    """A factor whose logarithm is given, as people write it."""
+    return f"{np.exp(nats):.2g}" if nats < 7 else f"10^{nats / np.log(10):.0f}"
+
+
+def _pictures(found: Diagnosis, one: Finding, names: Sequence[str]) -> list[Figure]:
     """The residual without everything but this finding, against what drives it, and over time."""
     problem, state = found.problem, found.state
     joint = int(np.argmax(one.rms_torque))
@@ -160,52 +221,55 @@ def _picture(found: Diagnosis, one: Finding, names: Sequence[str]) -> Figure:
     ordered = one.effect == "torque_ripple"
     hums = next((p["value"] for p in one.parameters if not one.terms and p["name"] == "frequency"), None)
 
-    def draw(canvas: Any) -> None:
-        left, right = canvas.subplots(1, 2, width_ratios=[1, 1.35])
-        canvas.subplots_adjust(left=0.07, right=0.995, bottom=0.14, top=0.92, wspace=0.16)
+    def regime(canvas: Any) -> None:
+        axis = canvas.subplots()
+        canvas.subplots_adjust(left=0.13, right=0.98, bottom=0.14, top=0.92)
         if delayed:
-            _draw_lags(left, found)
+            _draw_lags(axis, found)
         elif ordered:
             orders, _, amplitude = order_spectrum(
                 problem, problem.design((), state.noise), state.noise, joint
             )
-            left.vlines(orders, 0, amplitude, color=_AFTER, linewidth=0.8)
-            left.set(xlabel="order: periods in a turn of the joint", ylabel=f"amplitude [{force}]")
-            left.set_title("order spectrum of the residual")
+            axis.vlines(orders, 0, amplitude, color=_AFTER, linewidth=0.8)
+            axis.set(xlabel="order: periods in a turn of the joint", ylabel=f"amplitude [{force}]")
+            axis.set_title("order spectrum of the residual")
         elif hums is not None:
             tau = np.asarray(trace.signals.tau)[:, joint]
             frequencies = np.fft.rfftfreq(len(tau), 1 / trace.signals.rate)
-            left.semilogy(frequencies, sines(tau), color=_AFTER, linewidth=0.8)
-            left.axvline(hums, color=_FIT, linewidth=0.8, linestyle=":")
-            left.set(
+            axis.semilogy(frequencies, sines(tau), color=_AFTER, linewidth=0.8)
+            axis.axvline(hums, color=_FIT, linewidth=0.8, linestyle=":")
+            axis.set(
                 xlabel="frequency [Hz]",
                 ylabel=f"amplitude [{force}]",
                 xlim=(0, min(3 * hums, frequencies[-1])),
             )
-            left.set_title("spectrum of the measured torque")
+            axis.set_title("spectrum of the measured torque")
         else:
-            _draw_regime(left, xs, y, f)
-            left.set(xlabel=label, ylabel=f"residual of {names[joint]} [{force}]")
-            left.set_title("what is left without this finding, and its law")
+            _draw_regime(axis, xs, y, f)
+            axis.set(xlabel=label, ylabel=f"residual of {names[joint]} [{force}]")
+            axis.set_title("what is left without this finding, and its law")
+
+    def over_time(canvas: Any) -> None:
+        axis = canvas.subplots()
+        canvas.subplots_adjust(left=0.13, right=0.98, bottom=0.14, top=0.92)
         trail = np.full((2, trace.motion.samples), np.nan)  # no line across what does not count
         trail[:, rows[shown]] = lefts[shown], fits[shown]
-        _trail(right, trace.motion.time, trail[0], color="0.6", label="residual without this finding")
+        _trail(axis, trace.motion.time, trail[0], color="0.6", label="residual without this finding")
         if one.terms:
-            _trail(right, trace.motion.time, trail[1], color=_FIT, label="what it explains")
+            _trail(axis, trace.motion.time, trail[1], color=_FIT, label="what it explains")
         for a, b in one.intervals or ():
-            right.axvspan(a, b, color=_BEFORE, alpha=0.15, linewidth=0)
-        right.set(xlabel=f"time in {_short(trace.name)} [s]", ylabel=f"[{force}]")
-        right.set_title(f"{names[joint]} over time")
-        right.legend(loc="upper right", fontsize=7)
+            axis.axvspan(a, b, color=_BEFORE, alpha=0.15, linewidth=0)
+        axis.set(xlabel=f"time in {_short(trace.name)} [s]", ylabel=f"[{force}]")
+        axis.set_title(f"{names[joint]} over time")
+        axis.legend(loc="upper right", fontsize=7)
 
-    return Figure(
-        draw,
-        f"Why: the residual of {names[joint]} against {'lag' if delayed else label}"
-        if hums is None
-        else f"Why: what {names[joint]} measures has a line at one frequency",
-        (10.0, 3.4),
-        None,
-    )
+    why = f"Why: the residual of {names[joint]} against {'lag' if delayed else label}"
+    if hums is not None:
+        why = f"Why: what {names[joint]} measures has a line at one frequency"
+    return [
+        Figure(regime, why, (4.8, 3.4), None),
+        Figure(over_time, f"The same over time, in {_short(trace.name)}", (4.8, 3.4), None),
+    ]
 
 
 def _terms(found: Diagnosis, one: Finding):
@@ -417,9 +481,9 @@ def _next(found: Diagnosis, names: Sequence[str]) -> Section:
             Table(
                 ["to decide between", "joint", "expected of this motion", "of the recorded one again"],
                 rows,
-                "Expected evidence for whichever is true [nats]; 5 is one in 150",
+                "Expected log odds of whichever is true; 5 is 150 to 1",
             ),
-            Table(["motion", "nats"], tried, "What was compared, by the pair that it tells least"),
+            Table(["motion", "log odds"], tried, "What was compared, by the pair that it tells least"),
         ],
         [Figure(draw, f"{NEXT_MOTION}: joint positions", (10.0, 2.4), None)],
     )
@@ -495,7 +559,7 @@ def _regimes(caption: str, one: Localisation, names: Sequence[str]) -> Table:
         cells = [r for r in one.regimes if r.name == regime]
         rows.append([f"{regime}", *(f"{100 * c.share:.1f} %" if c.beyond else "" for c in cells)])
         shades.append([None, *(c.share**0.5 if c.beyond else None for c in cells)])
-    return Table(["by", *names], rows, caption, shades)
+    return Table(["by", *names], rows, caption, shades, more="share of the residual")
 
 
 def _heat_map(found: Diagnosis, names: Sequence[str]) -> Section:
@@ -517,22 +581,54 @@ def _heat_map(found: Diagnosis, names: Sequence[str]) -> Section:
                     ),
                 ]
             )
-            shades.append([None, *(None if np.isnan(g) or g < 3 else _faded(g, 3000.0) for g in gains)])
-        return Table(["effect", *names], rows, caption, shades)
+            shades.append([None, *(_shade(g) for g in gains)])
+        return Table(["effect", *names], rows, caption, shades, more="predicts better", less="predicts worse")
 
     tables = [table(heat.alone, "One effect alone added to your simulation; ● was found", True)]
     if found.findings:
         tables.append(table(heat.beside, "One more effect beside everything found", False))
+        tables += _rejected(found, names)
     return Section(
         "Every effect at every joint",
         [
-            "Gain of log likelihood [nats] on blocks of the recordings that the effect was not fitted to, in its"
+            "Gain of log likelihood on blocks of the recordings that the effect was not fitted to, in its"
             " best shape; negative where it makes them worse. What acts in the whole arm is split into the"
             " joints' shares; what happens once (a contact, a change of payload) has no second block to be tested"
-            " on."
+            " on. A gain of 5 is 150 to 1, of 14 a million to 1."
         ],
         tables,
     )
+
+
+def _shade(gain: float) -> float | None:
+    """How strongly a gain is coloured."""
+    if np.isnan(gain) or abs(gain) < 3:
+        return None
+    return float(np.sign(gain)) * _faded(abs(gain), 3000.0)
+
+
+def _rejected(found: Diagnosis, names: Sequence[str]) -> list[Table]:
+    """What would have explained something by itself and is not among the findings, and why."""
+    heat = found.heat_map
+    held = {(f.effect, j) for f in found.findings for j in f.joints}
+    rows = []
+    for effect, alone, beside in zip(heat.effects, heat.alone, heat.beside, strict=True):
+        for j, (gain, left) in enumerate(zip(alone, beside, strict=True)):
+            if np.isnan(gain) or gain < _TRIED or (effect, j) in held:
+                continue
+            if np.isnan(left) or left < _TRIED:
+                why = "what it would explain, the findings do"
+            else:
+                why = "predicts better beside the findings too, by less than so rare an effect must"
+            rows.append(
+                (gain, [_plain(effect), names[j], _gain(gain), "" if np.isnan(left) else _gain(left), why])
+            )
+    rows.sort(key=lambda row: -row[0])
+    if not rows:
+        return []
+    heads = ["effect", "joint", "gain alone", "beside the findings", "why it is not among them"]
+    caption = f"What was tried and left out, the first {min(len(rows), _REJECTED)} of {len(rows)}"
+    return [Table(heads, [row for _, row in rows[:_REJECTED]], caption, folded=True)]
 
 
 def _gain(value: float) -> str:
@@ -570,8 +666,35 @@ def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
             + ", in its unit, and below that as rms torque at the joint that feels it most. What is smaller"
             " cannot be excluded. Coloured: over 95 % of the effect is absorbed by what is refitted anyway.",
         ],
-        [Table(["effect", *names], rows, "", shades)],
+        [Table(["effect", *names], rows, "", shades, less="absorbed by what is refitted")],
     )
+
+
+def _numbers(found: Diagnosis) -> list[Table]:
+    """Numbers of the user's model that the corrected one has otherwise, before and after."""
+    arm, native = found.corrected.arm, found.corrected.native
+    unit = arm.unit
+    kinds = [
+        ("mass of", "kg", np.asarray(arm.standard[:, 0]), np.asarray(native.standard[:, 0]), arm.link_names)
+    ]
+    for kind, of in (
+        ("damping", "N·m·s/rad"),
+        ("frictionloss", "N·m"),
+        ("armature", "kg·m²"),
+        ("stiffness", "N·m/rad"),
+    ):
+        before, after = (np.asarray(getattr(a, kind)) for a in (arm, native))
+        kinds.append((f"{kind} of", of, before, after, arm.joint_names))
+    rows = [
+        [f"{what} {names[j]}", number(before[j]), number(after[j]), of if of == "kg" else unit(of, j)]
+        for what, of, before, after, names in kinds
+        for j in range(arm.dof)
+        if abs(after[j] - before[j]) > _CHANGED * max(abs(before[j]), 1e-9)
+    ]
+    if not rows:
+        return []
+    caption = "Numbers of your model, refitted or with what was found"
+    return [Table(["number", "before", "after", "unit"], rows, caption, folded=len(rows) > _MANY)]
 
 
 def _file(found: Diagnosis) -> Section:
@@ -597,7 +720,8 @@ def _file(found: Diagnosis) -> Section:
         )
     many = len(lines) > 60
     caption = f"Difference, {len(lines)} lines" if many else ""
-    return Section("Your file", sentences, listings=[Listing(lines, caption, many)] if lines else [])
+    listings = [Listing(lines, caption, many)] if lines else []
+    return Section("Your file", sentences, _numbers(found), listings=listings)
 
 
 def _method(found: Diagnosis, names: Sequence[str]) -> Section:
