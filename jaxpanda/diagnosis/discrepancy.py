@@ -91,27 +91,28 @@ def of_law(
     return np.split(np.concatenate(columns, 2), ends)
 
 
-def unresolved(traces: Sequence[Trace], torque: Torque) -> Float[np.ndarray, "rows dof"]:
+def unresolved(
+    traces: Sequence[Trace], effect: AbstractEffect, torque: Torque
+) -> Float[np.ndarray, "rows dof"]:
     """Square of what a law may be off from sample to sample [N² m²]: in proportion to its torque, and to how fast
-    that changes."""
-    rates = [np.gradient(tau, t.motion.dt, axis=0) for t, tau in zip(traces, torque, strict=True)]
-    return np.square(UNRESOLVED * np.concatenate(torque)) + np.square(TIMING * np.concatenate(rates))
-
-
-def held(traces: Sequence[Trace], effect: AbstractEffect, torque: Torque) -> Float[np.ndarray, "rows dof"]:
-    """Square of what dry friction may be off where its joint rests [N² m²]: all of it, as long as it rests."""
-    off = np.zeros_like(np.concatenate(torque))
+    that changes; dry friction at rest, by all of it."""
+    off = _in_proportion(traces, torque)
     if effect.dry and isinstance(effect, AbstractJointEffect):
         j = effect.joints[0]
         rests = [np.zeros(t.motion.samples) if t.unsure is None else t.unsure[:, j] for t in traces]
-        off[:, j] = np.square(_level(np.concatenate(torque)[:, j]) * np.concatenate(rests))
+        off[:, j] += np.square(_level(np.concatenate(torque)[:, j]) * np.concatenate(rests))
     return off
 
 
 def unresolved_known(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
     """The same of the friction that the user's model holds; where it rests `Trace.trust` says."""
     level = np.asarray(traces[0].motion.arm.frictionloss)
-    return unresolved(traces, [level * t.down(t.sign) for t in traces])
+    return _in_proportion(traces, [level * t.down(t.sign) for t in traces])
+
+
+def _in_proportion(traces: Sequence[Trace], torque: Torque) -> Float[np.ndarray, "rows dof"]:
+    rates = [np.gradient(tau, t.motion.dt, axis=0) for t, tau in zip(traces, torque, strict=True)]
+    return np.square(UNRESOLVED * np.concatenate(torque)) + np.square(TIMING * np.concatenate(rates))
 
 
 def _level(torque: Float[np.ndarray, " rows"]) -> float:

@@ -39,8 +39,6 @@ class Noise:
     """Of the noise itself [N m]."""
     trust: Float[np.ndarray, "rows dof"] | None = None
     """What a sample weighs beside what laws may be off there, 0 to 1; None where there are no laws."""
-    moving: Float[np.ndarray, "rows dof"] | None = None
-    """The same but for friction that holds a joint at rest."""
     slow: Float[np.ndarray, "dof 2"] | None = None
     """Pole p and zero z of a slow error beside the noise: what is white is $(1 - p L) / (1 - z L)$ of the
     innovations, with L the step back; as good as none where they are equal."""
@@ -70,18 +68,6 @@ class Noise:
         for rows in stretches(counts):
             out[rows], _ = levelled(y[rows], self.slow[joint])  # pyright: ignore
         return out
-
-    @property
-    def plain(self) -> "Noise":
-        """The noise where nothing is left unexplained."""
-        sigma = self.sigma if self.least is None else self.least
-        return dataclasses.replace(self, sigma=sigma, slow=None)
-
-    @property
-    def uneven(self) -> list[int]:
-        """Joints in which something is left unexplained."""
-        least = self.sigma if self.least is None else self.least
-        return [j for j in range(len(self.sigma)) if self.has_slow(j) or self.sigma[j] > least[j]]
 
     def has_slow(self, joint: int) -> bool:
         """Whether there is an error slower than the noise in a joint."""

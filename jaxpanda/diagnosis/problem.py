@@ -17,7 +17,7 @@ from ..arm import Arm
 from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect
 from ..errors import InputError
 from . import catchall
-from .discrepancy import held, of_law, unresolved, unresolved_known
+from .discrepancy import of_law, unresolved, unresolved_known
 from .evidence import Design, Noise, OnDemand
 from .host import parallel
 from .library import Candidates, build, columns_of
@@ -46,15 +46,13 @@ class Term:
     """What its law may be off, with coefficients of unit variance; none where empty."""
     unresolved: Float[np.ndarray, "rows dof"] | None = None
     """Square of what it may be off from sample to sample, which no column describes [N² m²]."""
-    held: Float[np.ndarray, "rows dof"] | None = None
-    """The same of dry friction where its joint rests [N² m²]."""
     prior: float = 0.0
     """Logarithm of its prior odds, less what the search over its shapes has cost [nats]."""
 
     @property
     def law(self) -> "Term":
         """The law alone, believed to the last digit."""
-        return dataclasses.replace(self, discrepancy=(), unresolved=None, held=None)
+        return dataclasses.replace(self, discrepancy=(), unresolved=None)
 
     @property
     def key(self) -> tuple[str, tuple[int, ...]]:
@@ -181,8 +179,7 @@ class Problem:
         torque = [x @ c for x in columns]
         evaluate = lambda other: [x @ c for x in self.full_columns(other)]
         off = tuple(of_law(self.traces, effect, torque, std, evaluate))
-        smooth, resting = unresolved(self.traces, torque), held(self.traces, effect, torque)
-        return Term(effect, columns, deviation, off, smooth, resting, prior)
+        return Term(effect, columns, deviation, off, unresolved(self.traces, effect, torque), prior)
 
     def full_columns(self, effect: AbstractEffect) -> list[Float[np.ndarray, "_time dof _n"]]:
         """Columns of an effect, at all joints."""
@@ -283,26 +280,18 @@ class Problem:
         return self._scanned[2]
 
     @functools.cached_property
-    def _joints(self) -> dict[tuple[int, bool, bool], Whitened]:
-        """By joint, whether its noise is more than what a saturated model leaves, and whether it may not last."""
+    def _joints(self) -> dict[tuple[int, bool], Whitened]:
+        """By joint, and whether its noise is more than what a saturated model leaves."""
         return {}
 
-    def whitened_joint(
-        self, noise: Noise, joint: int, terms: Sequence[Term] = (), *, tried: bool = False
-    ) -> Whitened:
-        """Residual, nuisance and terms in a joint, whitened; kept while the joint's noise stays.
-
-        `tried`: in noise that may not come again, for whose sake no other is forgotten.
-        """
+    def whitened_joint(self, noise: Noise, joint: int, terms: Sequence[Term] = ()) -> Whitened:
+        """Residual, nuisance and terms in a joint, whitened; kept while the joint's noise stays."""
         trust = None if noise.trust is None else noise.trust[:, joint].tobytes()
         slow = noise.slow[joint].tobytes() if noise.has_slow(joint) else None  # pyright: ignore
         stamp = noise.a[joint].tobytes(), float(noise.sigma[joint]), trust, slow
         widened = slow is not None or (noise.least is not None and noise.sigma[joint] != noise.least[joint])
-        key = joint, bool(widened), False
+        key = joint, bool(widened)
         here = self._joints.get(key)
-        if tried and (here is None or here.stamp != stamp):
-            key = joint, bool(widened), True
-            here = self._joints.get(key)
         if here is None or here.stamp != stamp:
             residual = self.whitened([r[:, joint] for r in self.residual], noise, joint)
             nuisance = self.whitened([n[:, joint] for n in self.nuisance], noise, joint)
@@ -316,8 +305,6 @@ class Problem:
 
     def forget(self, term: Term) -> None:
         """Give back what was kept of a term that was tried: a search tries thousands."""
-        for key in [key for key in self._noises if id(term) in key[1:]]:
-            del self._noises[key]
         for here in self._joints.values():
             _, rows = here.terms.pop(id(term), (term, None))
             if rows is not None:
@@ -325,9 +312,9 @@ class Problem:
                 for _, kept in here.blocks.values():
                     kept.pop(id(term), None)
 
-    def whitened_joints(self, noise: Noise, terms: Sequence[Term], *, tried: bool = False) -> list[Whitened]:
+    def whitened_joints(self, noise: Noise, terms: Sequence[Term]) -> list[Whitened]:
         """`whitened_joint` of all."""
-        return [self.whitened_joint(noise, j, terms, tried=tried) for j in range(self.dof)]
+        return [self.whitened_joint(noise, j, terms) for j in range(self.dof)]
 
     @functools.cached_property
     def _repeated(self) -> dict[Any, Block]:
@@ -351,15 +338,15 @@ class Problem:
             self._repeated[key, joint] = Block(key, joint, x.shape[1], flat)
         return projected(self, noise, design, [self._repeated[key, joint]])
 
-    def design(self, terms: Sequence[Term], noise: Noise, *, tried: bool = False) -> Design:
-        """The model with these terms, whitened; `tried`: in noise that may not come again."""
+    def design(self, terms: Sequence[Term], noise: Noise) -> Design:
+        """The model with these terms, whitened."""
         counts = [self.nuisance[0].shape[2], *(t.width for t in terms)]
         ends = np.cumsum([0, *counts])
         place = {
             key: slice(ends[i], ends[i + 1]) for i, key in enumerate(["nuisance", *(id(t) for t in terms)])
         }
         H, g = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
-        joints = self.whitened_joints(noise, terms, tried=tried)
+        joints = self.whitened_joints(noise, terms)
         for here in joints:
             acting = ["nuisance", *(id(t) for t in terms if here.rows(id(t)) is not None)]
             for i, left in enumerate(acting):
@@ -507,16 +494,8 @@ class Problem:
             )
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         off = self._known_unresolved + sum(t.unresolved for t in terms if t.unresolved is not None)
-        moving = 1 / np.sqrt(1 + off / np.square(std))
-        noise = Noise(np.stack(a), np.array(sigma), np.array(std), moving, moving)
-        return self.held_by(noise, terms)
-
-    def held_by(self, noise: Noise, terms: Sequence[Term]) -> Noise:
-        """Noise in which joints at rest are trusted as far as the dry friction of these terms leaves it."""
-        assert noise.moving is not None
-        resting = sum(t.held for t in terms if t.held is not None)
-        trust = 1 / np.sqrt(1 / np.square(noise.moving) + resting / np.square(noise.std))
-        return dataclasses.replace(noise, trust=trust)
+        trust = 1 / np.sqrt(1 + off / np.square(std))
+        return Noise(np.stack(a), np.array(sigma), np.array(std), trust)
 
     @functools.cached_property
     def _known_unresolved(self) -> Float[np.ndarray, "rows dof"]:

@@ -21,10 +21,10 @@ from .shapes import evidence_of, first_steps, refine
 from .state import (
     State,
     beside,
+    evidence,
     gains,
     in_noise,
     likelier,
-    likelihood,
     overlaps,
     places,
     start,
@@ -115,15 +115,16 @@ def choices(
     """What the foremost proposals bring with their discrepancies, beside these terms; the likeliest first."""
     if not proposals:
         return []
-    own = likelihood(problem, terms, noise)[0]
+    own = evidence(problem, terms, design, noise)
     best = proposals[0].evidence
     some = [p for p in proposals if p.evidence > (_WINDOW * best if best > 0 else UNLIKELY)][:_TRIED]
     out = []
     for p in some:
         for form in (p, *plainer(problem, design, noise, p)):
             term = taken(problem, design, noise, form)
-            found, more = likelihood(problem, (*terms, term), noise)
+            more = problem.design((*terms, term), noise)
             if is_possible(term, more):
+                found = evidence(problem, (*terms, term), more, noise)
                 out.append((found - own + term.prior, (term,)))
             problem.forget(term)
     return sorted(out, key=lambda choice: -choice[0])
@@ -225,7 +226,8 @@ def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
                 continue
             others = tuple(t for i, t in enumerate(state.terms) if i not in group)
             design = problem.design(others, state.noise)
-            own = likelihood(problem, state.terms, state.noise)[0] - beside(problem, state, group)
+            whole = evidence(problem, state.terms, state.design, state.noise)
+            own = whole - beside(problem, state, group, design)
             joints = None
             if all(isinstance(state.terms[i].effect, AbstractJointEffect) for i in group):
                 joints = {j for i in group for j in state.terms[i].effect.joints}
@@ -263,7 +265,7 @@ def instead(problem: Problem, state: State, i: int, free: bool = True) -> list[C
         found += [
             pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts, free))
         ]
-    own = likelihood(problem, state.terms, state.noise)[0] - beside(problem, state, (i,))
+    own = evidence(problem, state.terms, state.design, state.noise) - beside(problem, state, (i,), rest)
     return sorted([(own, (term,)), *found], key=lambda choice: -choice[0])
 
 

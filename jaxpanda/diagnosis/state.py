@@ -35,7 +35,14 @@ class State:
 
         Models may differ in their noise: what is likelier in a noise of its own is likelier.
         """
-        return self.design.log_evidence + unfitted(self.design, self.noise) + sum(t.prior for t in self.terms)
+        counted = 0.0
+        for j, r in enumerate(self.design.residual):
+            here = r != 0
+            width = np.full(len(r), self.noise.sigma[j])
+            if self.noise.trust is not None:
+                width = width / np.maximum(self.noise.trust[:, j], 1e-9)
+            counted += float(0.5 * np.sum(r**2) + np.log(width[here]).sum())
+        return self.design.log_evidence - counted + sum(t.prior for t in self.terms)
 
 
 def start(problem: Problem) -> State:
@@ -155,58 +162,19 @@ def without(state: State, i: int) -> Design:
 
 def gains(problem: Problem, state: State) -> list[float]:
     """By how much each term makes the model likelier, beside the others [nats]."""
-    own = likelihood(problem, state.terms, state.noise)[0]
-    return [own - beside(problem, state, (i,)) for i in range(len(state.terms))]
+    own = evidence(problem, state.terms, state.design, state.noise)
+    return [own - beside(problem, state, (i,), without(state, i)) for i in range(len(state.terms))]
 
 
-def beside(problem: Problem, state: State, which: Collection[int]) -> float:
-    """Log likelihood of the model without some of its terms, less their priors: what the whole must exceed for
-    them to be worth it."""
+def beside(problem: Problem, state: State, which: Collection[int], rest: Design) -> float:
+    """Log evidence of the model without some of its terms, `rest`, less their priors: what the whole must exceed
+    for them to be worth it."""
     others = [t for i, t in enumerate(state.terms) if i not in which]
-    return likelihood(problem, others, state.noise)[0] - sum(state.terms[i].prior for i in which)
+    paid = sum(state.terms[i].prior for i in which)
+    return evidence(problem, others, rest, state.noise) - paid
 
 
-def likelihood(problem: Problem, terms: Sequence[Term], noise: Noise) -> tuple[float, Design]:
-    """Log marginal likelihood of a model beside another's noise [nats], and the model fitted.
-
-    Noise is what a saturated model with these terms leaves, and what the other leaves beyond it; laws are trusted
-    as far as the other's are, but for the friction that holds joints at rest.
-    """
-    least, found = problem.noise(terms), []
-    if noise.least is not None:
-        sigma = least.sigma * noise.sigma / noise.least
-        least = dataclasses.replace(least, sigma=sigma, slow=noise.slow, least=least.sigma)
-    own = problem.held_by(dataclasses.replace(least, moving=noise.moving), terms)
-    # what a fit leaves depends on the noise it was made in: that one, and noise in which nothing is unexplained
-    for fitted_in in (own, *([own.plain] if own.uneven else [])):
-        design = problem.design(terms, fitted_in, tried=True)
-        value = evidence(problem, terms, design, fitted_in, own.uneven) + unfitted(design, fitted_in)
-        found.append((value, design))
-    return max(found, key=lambda one: one[0])
-
-
-def unfitted(design: Design, noise: Noise) -> float:
-    """Log likelihood of the recordings if nothing were fitted, up to a constant [nats].
-
-    Friction that holds a joint is not known, and stays what it is while the joint rests: it makes samples tell
-    less, and none less likely than noise is.
-    """
-    out = 0.0
-    for j, r in enumerate(design.residual):
-        here = r != 0
-        width = np.full(len(r), noise.sigma[j])
-        if noise.trust is not None:
-            moving = noise.trust if noise.moving is None else noise.moving
-            width = width / np.maximum(moving[:, j], 1e-9)
-            held = 1 - np.square(noise.trust[:, j] / moving[:, j])
-            out -= float(0.5 * held[here].sum())
-        out -= float(0.5 * np.sum(r**2) + np.log(width[here]).sum())
-    return out
-
-
-def evidence(
-    problem: Problem, terms: Sequence[Term], design: Design, noise: Noise, uneven: Sequence[int] | None = None
-) -> float:
+def evidence(problem: Problem, terms: Sequence[Term], design: Design, noise: Noise) -> float:
     r"""Log evidence of a model that was fitted in the noise beside another.
 
     Where a joint has errors beyond the saturated model's noise their size is not known, and falls with what is
@@ -214,7 +182,8 @@ def evidence(
     """
     if noise.least is None:
         return design.log_evidence
-    plain, uneven = noise.plain, noise.uneven if uneven is None else uneven
+    plain = dataclasses.replace(noise, sigma=noise.least, slow=None)
+    uneven = [j for j in range(problem.dof) if noise.has_slow(j) or noise.sigma[j] > noise.least[j]]
     gained, dt = 0.0, problem.traces[0].motion.dt
     for j, parts in zip(uneven, left_over(problem, plain, terms, design.x, uneven), strict=True):
         count = sum(map(np.count_nonzero, parts))
