@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from .finding import Finding
 
-WEIGHTS = (1.13, 0.08, 0.31, 1.19, -2.23)
+WEIGHTS = (0.53, 0.11, 0.58, 1.06, -2.19)
 """$w_0 \\ldots w_4$."""
 SUREST = 0.995
 """No finding is surer."""
