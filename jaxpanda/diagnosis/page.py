@@ -2,7 +2,7 @@
 
 import difflib
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -73,14 +73,13 @@ def _verdict(found: Diagnosis, document: Mapping[str, Any], names: Sequence[str]
         row: list[float | None] = [None]
         row += [-_faded(np.asarray(v)[j] / floor[j] - 1.15, 10.0) for v in list(columns.values())[:4]]
         shades.append([*row, None])
-    rows = [list(row) for row in table.rows]
-    for before, after in ((1, 2), (3, 4)):
-        told = list(columns.values())
-        for j, cells in enumerate(rows):
-            if told[after - 1][j] > _WORSE * max(told[before - 1][j], floor[j]):
-                cells[after] += " ▲"
-    worse = any("▲" in cell for row in rows for cell in row)
-    caption = table.caption + (" ▲ worse than before." if worse else "")
+    rows, told = [list(row) for row in table.rows], list(columns.values())
+    caption = table.caption
+    for j, cells in enumerate(rows):
+        for before, after in ((0, 1), (2, 3)):
+            if told[after][j] > _WORSE * max(told[before][j], floor[j]):
+                cells[1 + after] += " ▲"
+                caption = table.caption + " ▲ worse than before."
     shaded = Table(table.columns, rows, caption, shades, less="beyond the noise")
     return Section(
         "Verdict",
@@ -587,7 +586,7 @@ def _heat_map(found: Diagnosis, names: Sequence[str]) -> Section:
     tables = [table(heat.alone, "One effect alone added to your simulation; ● was found", True)]
     if found.findings:
         tables.append(table(heat.beside, "One more effect beside everything found", False))
-        tables += _rejected(found, names)
+        tables += _left_out(found, held, names)
     return Section(
         "Every effect at every joint",
         [
@@ -607,25 +606,24 @@ def _shade(gain: float) -> float | None:
     return float(np.sign(gain)) * _faded(abs(gain), 3000.0)
 
 
-def _rejected(found: Diagnosis, names: Sequence[str]) -> list[Table]:
-    """What would have explained something by itself and is not among the findings, and why."""
-    heat = found.heat_map
-    held = {(f.effect, j) for f in found.findings for j in f.joints}
-    rows = []
+def _left_out(found: Diagnosis, held: Collection[tuple[str, int]], names: Sequence[str]) -> list[Table]:
+    """What would have explained something by itself and is not among the findings (`held`)."""
+    heat, rows = found.heat_map, []
     for effect, alone, beside in zip(heat.effects, heat.alone, heat.beside, strict=True):
         for j, (gain, left) in enumerate(zip(alone, beside, strict=True)):
-            if np.isnan(gain) or gain < _TRIED or (effect, j) in held:
+            if not gain >= _TRIED or (effect, j) in held:  # NaN: was not tried
                 continue
-            if np.isnan(left) or left < _TRIED:
-                why = "what it would explain, the findings do"
-            else:
-                why = "predicts better beside the findings too, by less than so rare an effect must"
-            rows.append(
-                (gain, [_plain(effect), names[j], _gain(gain), "" if np.isnan(left) else _gain(left), why])
+            more = left >= _TRIED
+            why = (
+                "predicts better beside the findings too, and was not taken"
+                if more
+                else "the findings explain it"
             )
-    rows.sort(key=lambda row: -row[0])
+            cells = [_plain(effect), names[j], _gain(gain), "" if np.isnan(left) else _gain(left), why]
+            rows.append((gain, cells))
     if not rows:
         return []
+    rows.sort(key=lambda row: -row[0])
     heads = ["effect", "joint", "gain alone", "beside the findings", "why it is not among them"]
     caption = f"What was tried and left out, the first {min(len(rows), _REJECTED)} of {len(rows)}"
     return [Table(heads, [row for _, row in rows[:_REJECTED]], caption, folded=True)]

@@ -5,7 +5,7 @@ import functools
 import itertools
 import operator
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -354,12 +354,10 @@ class Problem:
                 for right in acting[: i + 1]:
                     H[place[left], place[right]] += here.product(left, right)
         H = np.tril(H) + np.tril(H, -1).T
-        for joint, rows, size in self._resting:
-            at_rest = lambda parts, rows=rows, size=size: np.concatenate(parts)[rows] / size
-            nuisance, residual = ([x[:, joint] for x in parts] for parts in (self.nuisance, self.residual))
-            A = np.concatenate([at_rest(nuisance), *(at_rest(t.at_joint(joint)) for t in terms)], 1)
+        for joint, picked, nuisance, residual in self._resting:
+            A = np.concatenate([nuisance, *(picked(t.at_joint(joint)) for t in terms)], 1)
             H += A.T @ A
-            g += A.T @ at_rest(residual)
+            g += A.T @ residual
         precision = np.concatenate([np.ones(counts[0]), *(t.precision for t in terms)])
         parts = [[(at, x) for key, at in place.items() if (x := h.rows(key)) is not None] for h in joints]
 
@@ -373,18 +371,23 @@ class Problem:
         return Design(columns, [h.residual for h in joints], precision, (H, g), terms)
 
     @functools.cached_property
-    def _resting(self) -> list[tuple[int, np.ndarray, float]]:
-        """Joints that no recording tells noise of, as where friction holds them, some of their rows, and the
-        deviation of the torque in each [N m], which counts as often as the user's model is off there: their
-        torque together tells as much as one sample. Without it models differ there in ways that nothing bounds.
+    def _resting(self) -> list[tuple[int, Callable, np.ndarray, np.ndarray]]:
+        """Joints that no recording tells noise of, as where friction holds them: what picks some rows of their
+        columns, and the nuisance and the residual there, over the deviation of the torque.
+
+        It is off by as much as with the user's model, and its rows together tell as much as one sample. Without
+        that models differ there in ways that nothing bounds.
         """
-        out = []
+        joints = [j for j in range(self.dof) if not self.saturation.tells(j)]
         rows = np.unique(np.linspace(0, self.rows[-1].stop - 1, _PICKED).astype(int))
-        for joint in range(self.dof):
-            if not self.saturation.tells(joint):
-                off = np.concatenate([r[:, joint] for r in self.residual])[rows]
-                size = float(np.sqrt(np.mean(off**2)))
-                out.append((joint, rows, max(size, QUIETEST) * np.sqrt(len(rows))))
+        each = [rows[(rows >= part.start) & (rows < part.stop)] - part.start for part in self.rows]
+        some = lambda parts: np.concatenate([x[k] for x, k in zip(parts, each, strict=True)])
+        out = []
+        for joint in joints:
+            residual = some([r[:, joint] for r in self.residual])
+            size = max(float(np.sqrt(np.mean(residual**2))), QUIETEST) * np.sqrt(len(rows))
+            nuisance = some([n[:, joint] for n in self.nuisance]) / size
+            out.append((joint, lambda parts, size=size: some(parts) / size, nuisance, residual / size))
         return out
 
     @functools.cached_property

@@ -21,6 +21,7 @@ from .calibration import SUREST
 from .finding import Finding, joined
 from .problem import Problem
 from .state import State, mean_squares, misfit
+from .traces import Trace
 
 BEYOND = 4.0
 """Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""
@@ -66,41 +67,55 @@ def standing_off(problem: Problem, state: State, named: Collection[int]) -> list
     beyond = np.minimum(
         beyond, mean_squares(problem, problem.noise(state.terms), state.terms, state.design.x)
     )
-    rms = np.sqrt(np.mean(left**2, 0))
-    out = []
-    for joint in set(np.flatnonzero(beyond >= BEYOND).tolist()) - set(named):
-        seen = []
-        for e, trace, count in suspect:
-            power = (e[:, joint] / noise[joint] * count[:, joint]) ** 2 / weight[joint]
-            power = scipy.ndimage.uniform_filter1d(power, max(1, round(_SMOOTHED / trace.motion.dt)))
-            seen.append((float(power[power > BEYOND].sum()), trace, trace.motion.time[power > BEYOND]))
-        _, trace, times = max(seen, key=lambda one: one[0])
-        when = joined([(float(t), float(t)) for t in times], _PAUSE)
-        whole = not when or sum(b - a for a, b in when) > 0.5 * float(np.ptp(trace.motion.time))
-        count = np.sum(weights[:, joint] > 0)
-        out.append(
-            Finding(
-                effect="unknown",
-                joints=(joint,),
-                recordings=(trace.name,),
-                intervals=None if whole else when,
-                confidence=float(1 - 1 / beyond[joint]),
-                alternatives=(),
-                equation="no law was found",
-                parameters=(),
-                rms_torque=rms * (np.arange(problem.dof) == joint),
-                evidence=float(0.5 * count * (beyond[joint] - 1 - np.log(beyond[joint]))),
-                summary=f"Joint {joint + 1} is {np.sqrt(beyond[joint]):.1f} times its noise off the simulation"
-                + (
-                    ""
-                    if whole
-                    else f" at times, in {trace.name} first from {when[0][0]:.2f} s to {when[0][1]:.2f} s"
-                )
-                + "; neither a named effect nor a free curve explains it.",
-                terms=(),
-            )
-        )
-    return out
+    far = set(np.flatnonzero(beyond >= BEYOND).tolist()) - set(named)
+    return [
+        _standing_off(j, float(beyond[j]), (noise**2 * weight)[j], suspect, problem.dof) for j in sorted(far)
+    ]
+
+
+def _standing_off(
+    joint: int,
+    beyond: float,
+    unit: float,
+    suspect: Sequence[tuple[np.ndarray, Trace, np.ndarray]],
+    dof: int,
+) -> Finding:
+    """A joint whose error's mean square is so many times its noise's.
+
+    Args:
+        joint: which.
+        beyond: how many times.
+        unit: square of a weighted error that counts as one of the noise's [N² m²].
+        suspect: what is left of each recording, and what its samples weigh.
+        dof: how many joints there are.
+    """
+    seen = []
+    for e, trace, count in suspect:
+        power = (e[:, joint] * count[:, joint]) ** 2 / unit
+        power = scipy.ndimage.uniform_filter1d(power, max(1, round(_SMOOTHED / trace.motion.dt)))
+        seen.append((float(power[power > BEYOND].sum()), trace, trace.motion.time[power > BEYOND]))
+    _, trace, times = max(seen, key=lambda one: one[0])
+    when = joined([(float(t), float(t)) for t in times], _PAUSE)
+    whole = not when or sum(b - a for a, b in when) > 0.5 * float(np.ptp(trace.motion.time))
+    at = "" if whole else f" at times, in {trace.name} first from {when[0][0]:.2f} s to {when[0][1]:.2f} s"
+    rms = np.zeros(dof)
+    rms[joint] = np.sqrt(np.mean(np.concatenate([e[:, joint] for e, _, _ in suspect]) ** 2))
+    samples = sum(np.count_nonzero(count[:, joint]) for _, _, count in suspect)
+    return Finding(
+        effect="unknown",
+        joints=(joint,),
+        recordings=(trace.name,),
+        intervals=None if whole else when,
+        confidence=1 - 1 / beyond,
+        alternatives=(),
+        equation="no law was found",
+        parameters=(),
+        rms_torque=rms,
+        evidence=float(0.5 * samples * (beyond - 1 - np.log(beyond))),
+        summary=f"Joint {joint + 1} is {np.sqrt(beyond):.1f} times its noise off the simulation{at}; neither a"
+        " named effect nor a free curve explains it.",
+        terms=(),
+    )
 
 
 def stuck(problem: Problem, std: Float[np.ndarray, " dof"]) -> Finding | None:
