@@ -23,6 +23,8 @@ import scipy.signal
 import scipy.special
 from jaxtyping import Bool, Float
 
+from .bodies import likeliest
+
 SCALES = (1.0, 4.0, 16.0)
 """Sizes of an effect over the noise, per sample, that are expected alike."""
 PHYSICAL_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0)
@@ -142,7 +144,22 @@ class Design:
         self.normal = normal
         self.information, self.g = normal[0] + np.diag(precision), normal[1]
         self.factor = scipy.linalg.cho_factor(self.information, lower=True) if len(self.g) else None
-        self.x = self.solve(self.g)
+        self.x, self.cost = self.admissible(self.solve(self.g), self.solve)
+
+    def admissible(
+        self, x: Float[np.ndarray, " n"], solve: Callable[[np.ndarray], np.ndarray]
+    ) -> tuple[Float[np.ndarray, " n"], float]:
+        """The likeliest coefficients whose bodies can be built, and what that costs [nats].
+
+        x: the likeliest of all; `solve`: multiplies by their covariance.
+        """
+        ends = len(x) - sum(t.width for t in self.terms) + np.cumsum([0, *(t.width for t in self.terms)])
+        held = [
+            (slice(int(at), int(at) + len(t.deviation)), t.body)
+            for at, t in zip(ends, self.terms, strict=False)
+            if t.body is not None
+        ]
+        return likeliest(x, solve, held) if held else (x, 0.0)
 
     def without(self, i: int) -> "Design":
         """The model less one of its terms."""
@@ -174,7 +191,8 @@ class Design:
         if self.factor is None:
             return 0.0
         half_determinant = np.log(np.diag(self.factor[0])).sum()
-        return float(0.5 * self.g @ self.x - half_determinant + 0.5 * np.log(self.precision).sum())
+        best = 0.5 * self.g @ self.solve(self.g) - self.cost
+        return float(best - half_determinant + 0.5 * np.log(self.precision).sum())
 
     def in_joint(
         self, joint: int, Phi: Float[np.ndarray, "rows m n"], G: Float[np.ndarray, "m n n"]
@@ -205,6 +223,16 @@ class Design:
             C = scipy.linalg.solve_triangular(self.factor[0], C, lower=True)
             G = G - gram(C.reshape(-1, m, n))
         return b, G
+
+
+def independent(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
+    r"""How many samples tell of a mean square, $n / (1 + 2 \sum \rho_k^2)$ (Bartlett 1946), lags up to where the
+    correlation has first changed its sign."""
+    n = len(x)
+    spectrum = np.abs(np.fft.rfft(x, 2 * n, axis=0)) ** 2
+    rho = np.fft.irfft(spectrum, axis=0)[:n] / np.maximum(np.sum(x**2, 0), 1e-300)
+    related = np.cumprod(rho > 0, 0)[1:] * rho[1:]
+    return np.count_nonzero(x, 0) / (1 + 2 * np.sum(related**2, 0))
 
 
 def gram(F: Float[np.ndarray, "rows m n"]) -> Float[np.ndarray, "m n n"]:

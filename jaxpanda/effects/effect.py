@@ -142,6 +142,12 @@ class AbstractEffect(eqx.Module):
         return self
 
     @property
+    def body(self) -> tuple[Float[np.ndarray, "10"], Float[np.ndarray, "10 n"]] | None:
+        r"""$\phi$ and D of standard parameters $\phi + D c$ that must be a body's, with the coefficients c; or
+        None."""
+        return None
+
+    @property
     def plainer(self) -> tuple["AbstractEffect", ...]:
         """Forms with fewer numbers that may do as well, where what the law may be off is allowed for."""
         return ()

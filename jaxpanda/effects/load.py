@@ -111,6 +111,11 @@ class InertialParameters(AbstractArmEffect):
         """Link, and what is added to its standard parameters."""
         return self.link, self._basis[0] @ c
 
+    @property
+    def body(self):
+        """The link as it is then."""
+        return np.array(self.standard), self._basis[0]
+
     def parameters(self, c, covariance) -> list[dict[str, Any]]:
         return _as_body(self, self._basis[0], c, covariance)
 
@@ -157,6 +162,10 @@ class Payload(AbstractArmEffect):
     def standard_change(self, c: Numbers) -> tuple[int, Float[Array, "10"] | Float[np.ndarray, "10"]]:
         """Link, and what is added to its standard parameters."""
         return self.link, self._basis[0] @ c
+
+    @property
+    def body(self):
+        return np.zeros(10), self._basis[0]
 
     def parameters(self, c, covariance) -> list[dict[str, Any]]:
         return _as_body(self, self._basis[0], c, covariance)
@@ -234,6 +243,10 @@ class PayloadChange(AbstractArmEffect):
     @property
     def feels(self) -> Literal["motion", "load", "acceleration"]:
         return "load"
+
+    @property
+    def body(self):
+        return np.zeros(10), self._basis[0]
 
     def carried(self, c: Numbers) -> tuple[int, Float[Array, "10"]] | None:
         return self.link, jnp.asarray(self._basis[0] @ c)

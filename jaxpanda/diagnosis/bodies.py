@@ -1,0 +1,145 @@
+r"""Of the bodies that can be built, those that the recordings are likeliest with.
+
+A law that adds a body, or changes a link, is linear in standard parameters, and a Gaussian prior lets them be
+anyone's. A body's pseudo-inertia is positive, $J(c) = J_0 + \sum_k c_k J_k \succ 0$ (Wensing, Kim, Slotine, RA-L
+2018). With the coefficients $\hat c$ that are likeliest without that, and their covariance C,
+
+$$\min_c\; \tfrac12 (c - \hat c)^\top C^{-1} (c - \hat c) - \mu \sum_{bodies} \log\det J(c)$$
+
+for falling $\mu$ (Boyd and Vandenberghe, Convex Optimization 2004, ch. 11).
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxpanda_kernels.inertia import pseudo_inertia
+from jaxtyping import Float
+
+
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """A pseudo-inertia, affine in some coefficients."""
+
+    constant: Float[np.ndarray, "4 4"]
+    steps: Float[np.ndarray, "n 4 4"]
+    begin: Float[np.ndarray, " n"]
+    """Coefficients of some body that can be built."""
+
+    def at(self, c: Float[np.ndarray, " n"]) -> Float[np.ndarray, "4 4"]:
+        return self.constant + np.tensordot(c, self.steps, 1)
+
+
+@functools.cache
+def _pseudo_inertias() -> Float[np.ndarray, "10 4 4"]:
+    """Of each standard parameter by itself."""
+    return np.stack([np.asarray(pseudo_inertia(jnp.asarray(e))) for e in np.eye(10)]).astype(float)
+
+
+def body(phi: Float[np.ndarray, "10"], directions: Float[np.ndarray, "10 n"]) -> Body | None:
+    """Of standard parameters $\\phi + D c$; None where the body that it begins from could not be built itself.
+
+    Args:
+        phi: what is there before; nothing, if the whole body is sought.
+        directions: D; without `phi` its first column is a body.
+    """
+    constant, steps = (np.tensordot(x, _pseudo_inertias(), (0, 0)) for x in (phi, directions))
+    begin = constant if np.any(phi) else steps[0]
+    values, vectors = np.linalg.eigh(begin)
+    if values[0] < -_ROUNDING * values[-1]:
+        return None
+    inside = (vectors * np.maximum(values, _INSIDE * values[-1])) @ vectors.T
+    flat = lambda J: J.reshape(*J.shape[:-2], 16)
+    c = np.linalg.lstsq(flat(steps).T, flat(inside - constant), rcond=None)[0]
+    # a link of a file may lie on the boundary: it can be built all the same
+    lifted = inside - begin if np.any(phi) else np.zeros((4, 4))
+    return Body(constant + _MARGIN * lifted, steps, c)
+
+
+def likeliest(
+    x: Float[np.ndarray, " n"],
+    solve: Callable[[np.ndarray], np.ndarray],
+    bodies: Sequence[tuple[slice, Body]],
+) -> tuple[Float[np.ndarray, " n"], float]:
+    """Coefficients whose bodies can be built, and what they cost [nats].
+
+    Args:
+        x: the likeliest of all.
+        solve: multiplies by their covariance.
+        bodies: and where their coefficients are.
+    """
+    if all(np.linalg.eigvalsh(b.at(x[at]))[0] >= 0 for at, b in bodies):
+        return x, 0.0
+    at = np.concatenate([np.arange(where.start, where.stop) for where, _ in bodies])
+    wide = solve(np.eye(len(x))[:, at])
+    C = wide[at]
+    deviation = np.sqrt(np.diag(C))
+    correlation = C / np.outer(deviation, deviation)
+    root = deviation[:, None] * np.linalg.cholesky(correlation + _ROUNDING * np.eye(len(at)))
+    ends = np.cumsum([0, *(len(b.begin) for _, b in bodies)])
+    blocks = [
+        (b.at(x[where]), np.tensordot(root[lo:hi], b.steps, (0, 0)))
+        for (where, b), lo, hi in zip(bodies, ends[:-1], ends[1:], strict=True)
+    ]
+    start = np.concatenate([b.begin for _, b in bodies]) - x[at]
+    z = _inside(blocks, scipy.linalg.solve_triangular(root, start, lower=True))
+    weights = scipy.linalg.solve_triangular(root, z, lower=True, trans=1)
+    return x + wide @ weights, 0.5 * float(z @ z)
+
+
+Blocks = Sequence[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "n 4 4"]]]
+
+
+def _inside(blocks: Blocks, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """The z nearest to zero at which every matrix is positive, from one at which they are."""
+    price = max(0.5 * float(z @ z) / (4 * len(blocks)), _PRICE)
+    while True:
+        for _ in range(_STEPS):
+            value, gradient, hessian = _barrier(blocks, z, price, derivatives=True)
+            step = -np.linalg.solve(hessian, gradient)
+            decrement = -float(gradient @ step)
+            if decrement < _CLOSE * price:
+                break
+            length = 1.0
+            while length > _ROUNDING:
+                if _barrier(blocks, z + length * step, price)[0] <= value - 0.1 * length * decrement:
+                    break
+                length *= 0.5
+            else:
+                break
+            z = z + length * step
+        if price <= _PRICE:
+            return z
+        price = max(price / _FALL, _PRICE)
+
+
+def _barrier(
+    blocks: Blocks, z: Float[np.ndarray, " n"], price: float, *, derivatives: bool = False
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """$\\tfrac12 z^\\top z - \\mu \\sum \\log\\det J(z)$, infinite outside, and its derivatives."""
+    value, gradient, hessian = 0.5 * float(z @ z), z.copy(), np.eye(len(z))
+    for constant, steps in blocks:
+        try:
+            factor = np.linalg.cholesky(constant + np.tensordot(z, steps, 1))
+        except np.linalg.LinAlgError:
+            return np.inf, gradient, hessian
+        value -= 2 * price * float(np.log(np.diag(factor)).sum())
+        if derivatives:
+            inverse = scipy.linalg.solve_triangular(factor, np.eye(4), lower=True)
+            level = (inverse @ steps @ inverse.T).reshape(len(z), 16)
+            gradient = gradient - price * level[:, ::5].sum(1)
+            hessian = hessian + price * level @ level.T
+    return value, gradient, hessian
+
+
+_ROUNDING = 1e-9
+_INSIDE = 1e-3
+"""Least eigenvalue of the body that a search begins from, as a share of the largest."""
+_MARGIN = 1e-3
+_PRICE, _FALL = 0.01, 10.0
+"""Last price of nearness to the boundary [nats], of which a body costs four at most, and by how much it falls."""
+_STEPS, _CLOSE = 30, 0.1
+"""Newton's steps for each price, and the decrement that ends them, over the price."""
