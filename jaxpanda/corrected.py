@@ -51,6 +51,13 @@ class Corrected(eqx.Module):
     turning: float | None = eqx.field(default=None, static=True)
     """Velocity over which a prediction lets the model's Coulomb friction turn [rad/s], as it did in the
     recordings; None: as MuJoCo's constraint does."""
+    cutoffs: tuple[float | None, ...] = eqx.field(default=(), static=True)
+    """Up to which a prediction takes motion into account in each joint's torque [Hz], as that of the recordings
+    showed it; None, or no entries: as far as q shows it."""
+
+    def below(self, cutoff: float | None) -> "Corrected":
+        """The same with that cutoff at every joint."""
+        return dataclasses.replace(self, cutoffs=(cutoff,) * self.arm.dof)
 
     @property
     def native(self) -> Arm:
@@ -206,6 +213,7 @@ class Corrected(eqx.Module):
             "damping_change": np.asarray(self.damping_change).tolist(),
             "frictionloss_change": np.asarray(self.frictionloss_change).tolist(),
             "turning": self.turning,
+            "cutoffs": list(self.cutoffs),
             "effects": [
                 {**effect.to_json(), "coefficients": np.asarray(c).tolist()}
                 for effect, c in zip(self.effects, self.coefficients, strict=True)
@@ -236,6 +244,7 @@ class Corrected(eqx.Module):
             tuple(found),
             tuple(numbers(e["coefficients"]) for e in document["effects"]),
             None if document.get("turning") is None else float(document["turning"]),
+            tuple(None if x is None else float(x) for x in document.get("cutoffs") or ()),
         )
 
 

@@ -33,6 +33,7 @@ from ..recordings import Recording, distinct, load
 from ..session import Say, silent
 from . import knowledge as knowledge_
 from . import saved
+from .as_recorded import as_recorded, predicted
 from .calibration import calibrated
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
@@ -48,7 +49,6 @@ from .resting import AtRest, judge, rests
 from .search import transferable
 from .state import State, with_terms
 from .traces import Trace, prepare
-from .turning import turning_as
 from .uncertainty import polished
 from .unnamed import BEYOND
 
@@ -246,7 +246,7 @@ def diagnose(
     found = (*found, *wrong)
     corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
     corrected = _buildable(source, corrected, problem)
-    corrected = turning_as(in_question, corrected, problem.noise(()).std)
+    corrected = as_recorded(in_question, corrected, problem.noise(()).std)
     fitted = fit(problem, kept)
     if any(lost):
         dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
@@ -271,7 +271,7 @@ def diagnose(
             *(n for t in traces for n in _still(t)),
             *_unheard(problem),
             *_turned(problem, state),
-            *_turning(corrected),
+            *_as_recorded(corrected),
             *(n for t in traces for n in t.signals.notes),
             *warnings,
         ),
@@ -329,14 +329,19 @@ def _turned(problem: Problem, state: State) -> list[str]:
     ]
 
 
-def _turning(corrected: Corrected) -> list[str]:
-    """A sentence where predictions turn known friction otherwise than MuJoCo does."""
-    if corrected.turning is None:
-        return []
-    return [
-        f"`predict` turns the model's Coulomb friction over {corrected.turning:g} rad/s, which is nearer to the"
-        " recordings than MuJoCo's constraint, by which corrected.xml and simulations turn it"
-    ]
+def _as_recorded(corrected: Corrected) -> list[str]:
+    """Sentences where predictions differ from MuJoCo's, or take less of the motion than q shows."""
+    out = []
+    if corrected.turning is not None:
+        out.append(
+            f"`predict` turns the model's Coulomb friction over {corrected.turning:g} rad/s, which is nearer to"
+            " the recordings than MuJoCo's constraint, by which corrected.xml and simulations turn it"
+        )
+    low = {j + 1: cutoff for j, cutoff in enumerate(corrected.cutoffs) if cutoff is not None}
+    if low:
+        said = ", ".join(f"{cutoff:g} Hz at joint {joint}" for joint, cutoff in low.items())
+        out.append(f"`predict` leaves out faster motion than the recorded torque shows: above {said}")
+    return out
 
 
 def _judged(problem: Problem) -> list[bool]:
@@ -556,7 +561,6 @@ def predict(
     corrected, noise = read(folder, effects)
     recording = motion if isinstance(motion, Recording) else load(motion)
     recording.require_dof(corrected.arm.dof)
-    trace = prepare(recording, corrected.arm, whole=True, noise=noise, turning=corrected.turning)
-    tau = corrected.measured_torque(trace.motion, trace.channels, trace.sign)
+    trace, tau = predicted(recording, corrected, noise)
     grid = trace.motion.time
     return np.stack([np.interp(recording.time, grid, column) for column in tau.T], 1)

@@ -1,0 +1,72 @@
+r"""What a prediction has to say of the recordings' torque that a diagnosis need not ask.
+
+Friction at rest: MuJoCo's constraint holds a joint almost without creep; the bristles of a gear yield by some
+mrad. What they do depends on where the joint came from, which few recordings tell, so for them it is
+$\tanh(\dot q/v)$, about their mean over many motions. And how much of fast motion the torque shows: its channel
+may be filtered more than q is. A diagnosis weighs such samples down. A prediction takes of each what is nearer to
+the recordings' torque.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ..corrected import Corrected
+from ..recordings import Recording
+from .traces import Trace, prepare
+
+GEAR = 0.01
+"""Velocity over which the friction of a gear turns [rad/s]."""
+CUTOFFS = (40.0, 30.0, 20.0, 15.0, 10.0, 7.0, 5.0)
+"""Low-passes of the motion that are tried [Hz]."""
+MOST = 0.5
+"""Of the squared error of predictions, what must be motion that the torque does not show."""
+
+
+def as_recorded(
+    recordings: Sequence[Recording], corrected: Corrected, noise: Float[np.ndarray, " dof"]
+) -> Corrected:
+    """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings."""
+    best, (measured, torque) = corrected, _compared(recordings, corrected, noise)
+    squares = lambda x: np.maximum(np.sum((measured - x) ** 2, 0), 1e-300)
+    if np.any(np.asarray(corrected.arm.frictionloss + corrected.frictionloss_change)):
+        gear = dataclasses.replace(corrected, turning=GEAR)
+        other = _compared(recordings, gear, noise)[1]
+        if np.sum(np.log(squares(other) / squares(torque))) < 0:
+            best, torque = gear, other
+    slower = [squares(_compared(recordings, best.below(cutoff), noise)[1]) for cutoff in CUTOFFS]
+    least = np.min(slower, 0)
+    # a smaller share may be noise of q, and another motion faster
+    filtered = least < MOST * squares(torque)
+    cutoffs = [CUTOFFS[k] if low else None for k, low in zip(np.argmin(slower, 0), filtered, strict=True)]
+    return dataclasses.replace(best, cutoffs=tuple(cutoffs) if any(filtered) else ())
+
+
+def predicted(
+    recording: Recording, corrected: Corrected, noise: Float[np.ndarray, " dof"]
+) -> tuple[Trace, Float[np.ndarray, "time dof"]]:
+    """A motion on the grid of a prediction, and the torque there [N m]."""
+    out: dict[float | None, tuple[Trace, np.ndarray]] = {}
+    cutoffs = corrected.cutoffs or (None,) * corrected.arm.dof
+    for cutoff in dict.fromkeys(cutoffs):
+        trace = prepare(
+            recording, corrected.arm, whole=True, noise=noise, turning=corrected.turning, cutoff=cutoff
+        )
+        out[cutoff] = trace, corrected.measured_torque(trace.motion, trace.channels, trace.sign)
+    torque = np.stack([out[cutoff][1][:, joint] for joint, cutoff in enumerate(cutoffs)], 1)
+    return out[cutoffs[0]][0], torque
+
+
+def _compared(
+    recordings: Sequence[Recording], corrected: Corrected, noise: Float[np.ndarray, " dof"]
+) -> tuple[Float[np.ndarray, "rows dof"], Float[np.ndarray, "rows dof"]]:
+    """Measured and predicted torque of all recordings, without gaps."""
+    both = []
+    for recording in recordings:
+        trace, torque = predicted(recording, corrected, noise)
+        assert trace.tau is not None
+        both.append((trace.tau[trace.weight > 0], torque[trace.weight > 0]))
+    measured, torque = (np.concatenate(parts) for parts in zip(*both, strict=True))
+    return measured, torque
