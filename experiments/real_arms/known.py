@@ -7,6 +7,10 @@ from reference import BAND, inner, lowpass, motion
 
 HELPS = 0.05
 """Share of the residual's square that a family must explain on the held-out recording, fitted on the others."""
+ORDERS, TURNED = (20.0, 420.0, 0.25), 0.2
+"""Of ripples that are looked for [periods a turn], and by how much a joint must turn [rad]."""
+PEAKS, APART, NONE = 3, 3.0, 100
+"""Orders that are tried held out, how far they are apart, and how many show what chance explains."""
 
 
 def families(chain, log):
@@ -66,6 +70,41 @@ def _gain(A, b, A_test, b_test, ridge=1e-3):
     return share(A_test, b_test), share(A, b)
 
 
+def _rippled(train, held, left):
+    """Joints whose error goes with the same order of the joint's angle, in the same phase, on all recordings.
+
+    Orders that explain most of the training recordings are tried on the held-out one, their amplitudes and phases
+    kept. There they must explain more than each of a hundred orders drawn at random, fitted alike, do by chance.
+    A ripple is often faster than BAND: nothing is low-passed, neighbours are differenced instead.
+    """
+    orders, others = np.arange(*ORDERS), np.random.default_rng(0).uniform(ORDERS[0], ORDERS[1], NONE)
+    changes = lambda x: np.diff(x, axis=0)
+    rows = [left(x) for x in train], left(held)
+    joints = []
+    for j in range(held.q.shape[1]):
+        at = [x.q[inner(x), j] for x in (*train, held)]
+        if min(np.ptp(x) for x in at) < TURNED:
+            continue
+        b, b_test = np.concatenate([changes(x[:, j]) for x in rows[0]]), changes(rows[1][:, j])
+
+        def explains(order, at=at, b=b, b_test=b_test):
+            """Shares of the squared change that it explains: (held out, of the others)."""
+            A = [changes(np.stack([np.sin(order * q), np.cos(order * q)], 1)) for q in at]
+            return _gain(np.concatenate(A[:-1]), b, A[-1], b_test, ridge=1e-6)
+
+        seen = np.array([explains(k)[1] for k in orders])
+        peaks = []
+        for k in np.argsort(-seen):
+            if all(abs(orders[k] - orders[p]) > APART for p in peaks):
+                peaks.append(k)
+            if len(peaks) == PEAKS:
+                break
+        chance = max(explains(k)[0] for k in others)
+        if max(explains(orders[k])[0] for k in peaks) > max(chance, 0.0):
+            joints.append(j + 1)
+    return joints
+
+
 def known_structure(train, held, said, chain, noise):
     """Claims that are neither right nor wrong: {effect, joints, why} of families that help where not fitted.
 
@@ -91,6 +130,10 @@ def known_structure(train, held, said, chain, noise):
                 for e in tables[0][name][0]
             ]
             somewhere |= set(joints)
+    full = lambda log: (log.tau - said(log))[inner(log)]
+    if joints := _rippled(train, held, full):
+        why = "an order of the joint's angle comes again held out"
+        allowed.append({"effect": "torque_ripple", "joints": joints, "why": why})
     tables = [whole(chain, x) for x in [*train, held]]
     for name in tables[0]:
         parts = [band(t[name][1], x) for t, x in zip(tables, [*train, held], strict=True)]
