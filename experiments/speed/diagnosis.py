@@ -106,7 +106,8 @@ def identifications(folder: Path, rounds: int) -> list[dict]:
 
 
 def child(folder: Path, cache: Path, rounds: int, platform_: str | None) -> dict:
-    environment = os.environ | {"JAXPANDA_CACHE": str(cache)}
+    # on a GPU another process of this script must find memory too
+    environment = os.environ | {"JAXPANDA_CACHE": str(cache), "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     if platform_:
         environment["JAX_PLATFORMS"] = platform_
     command = [sys.executable, __file__, "--child", str(folder), "--rounds", str(rounds)]
