@@ -287,6 +287,8 @@ def _check_numbers(found: Corrected, noise: np.ndarray) -> None:
         shape = (n, 10) if name in ("standard", "change") else (n,)
         if values.shape != shape or not (name in ("lower", "upper") or np.isfinite(values).all()):
             raise ValueError(f"{name} must hold {' x '.join(map(str, shape))} numbers")
+    if len(found.cutoffs) not in (0, n) or not all(x is None or 0 < x < np.inf for x in found.cutoffs):
+        raise ValueError(f"cutoffs must hold {n} positive numbers")
 
 
 class Plant(eqx.Module):

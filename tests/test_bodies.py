@@ -63,6 +63,7 @@ def test_link_that_could_not_be_built_itself_bounds_nothing():
     """A file's own links may be rough: then nothing is known of what the changed link must be."""
     phi = np.array([1.0, 0, 0, 0, 1e-3, 0, 1e-3, 0, 0, 1e-2])
     assert body(phi, np.eye(10)) is None
+    assert body(np.zeros(10), np.zeros((10, 10))) is None  # a link without mass
 
 
 def test_a_model_pays_for_what_cannot_be_built():

@@ -40,7 +40,7 @@ def _pseudo_inertias() -> Float[np.ndarray, "10 4 4"]:
 
 
 def body(phi: Float[np.ndarray, "10"], directions: Float[np.ndarray, "10 n"]) -> Body | None:
-    """Of standard parameters $\\phi + D c$; None where the body that it begins from could not be built itself.
+    """Of standard parameters $\\phi + D c$; None where there is no body to begin from that can be built itself.
 
     Args:
         phi: what is there before; nothing, if the whole body is sought.
@@ -49,7 +49,7 @@ def body(phi: Float[np.ndarray, "10"], directions: Float[np.ndarray, "10 n"]) ->
     constant, steps = (np.tensordot(x, _pseudo_inertias(), (0, 0)) for x in (phi, directions))
     begin = constant if np.any(phi) else steps[0]
     values, vectors = np.linalg.eigh(begin)
-    if values[0] < -_ROUNDING * values[-1]:
+    if values[-1] <= 0 or values[0] < -_ROUNDING * values[-1]:
         return None
     inside = (vectors * np.maximum(values, _INSIDE * values[-1])) @ vectors.T
     flat = lambda J: J.reshape(*J.shape[:-2], 16)
