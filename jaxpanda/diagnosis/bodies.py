@@ -1,8 +1,8 @@
 r"""Of the bodies that can be built, those that the recordings are likeliest with.
 
-A law that adds a body, or changes a link, is linear in standard parameters, and a Gaussian prior lets them be
-anyone's. A body's pseudo-inertia is positive, $J(c) = J_0 + \sum_k c_k J_k \succ 0$ (Wensing, Kim, Slotine, RA-L
-2018). With the coefficients $\hat c$ that are likeliest without that, and their covariance C,
+A law that adds a body is linear in its standard parameters, and a Gaussian prior lets them be anyone's. A body's
+pseudo-inertia is positive, $J(c) = \sum_k c_k J_k \succ 0$ (Wensing, Kim, Slotine, RA-L 2018). With the
+coefficients $\hat c$ that are likeliest without that, and their covariance C,
 
 $$\min_c\; \tfrac12 (c - \hat c)^\top C^{-1} (c - \hat c) - \mu \sum_{bodies} \log\det J(c)$$
 
@@ -22,15 +22,14 @@ from jaxtyping import Float
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A pseudo-inertia, affine in some coefficients."""
+    """A pseudo-inertia, linear in some coefficients."""
 
-    constant: Float[np.ndarray, "4 4"]
     steps: Float[np.ndarray, "n 4 4"]
     begin: Float[np.ndarray, " n"]
     """Coefficients of some body that can be built."""
 
     def at(self, c: Float[np.ndarray, " n"]) -> Float[np.ndarray, "4 4"]:
-        return self.constant + np.tensordot(c, self.steps, 1)
+        return np.tensordot(c, self.steps, 1)
 
 
 @functools.cache
@@ -39,24 +38,12 @@ def _pseudo_inertias() -> Float[np.ndarray, "10 4 4"]:
     return np.stack([np.asarray(pseudo_inertia(jnp.asarray(e))) for e in np.eye(10)]).astype(float)
 
 
-def body(phi: Float[np.ndarray, "10"], directions: Float[np.ndarray, "10 n"]) -> Body | None:
-    """Of standard parameters $\\phi + D c$; None where there is no body to begin from that can be built itself.
-
-    Args:
-        phi: what is there before; nothing, if the whole body is sought.
-        directions: D; without `phi` its first column is a body.
-    """
-    constant, steps = (np.tensordot(x, _pseudo_inertias(), (0, 0)) for x in (phi, directions))
-    begin = constant if np.any(phi) else steps[0]
-    values, vectors = np.linalg.eigh(begin)
-    if values[-1] <= 0 or values[0] < -_ROUNDING * values[-1]:
-        return None
+def body(directions: Float[np.ndarray, "10 n"]) -> Body:
+    """Of standard parameters that are so many for each coefficient, the first one's a body's."""
+    steps = np.tensordot(directions, _pseudo_inertias(), (0, 0))
+    values, vectors = np.linalg.eigh(steps[0])
     inside = (vectors * np.maximum(values, _INSIDE * values[-1])) @ vectors.T
-    flat = lambda J: J.reshape(*J.shape[:-2], 16)
-    c = np.linalg.lstsq(flat(steps).T, flat(inside - constant), rcond=None)[0]
-    # a link of a file may lie on the boundary: it can be built all the same
-    lifted = inside - begin if np.any(phi) else np.zeros((4, 4))
-    return Body(constant + _MARGIN * lifted, steps, c)
+    return Body(steps, np.linalg.lstsq(steps.reshape(-1, 16).T, inside.ravel(), rcond=None)[0])
 
 
 def likeliest(
@@ -138,7 +125,6 @@ def _barrier(
 _ROUNDING = 1e-9
 _INSIDE = 1e-3
 """Least eigenvalue of the body that a search begins from, as a share of the largest."""
-_MARGIN = 1e-3
 _PRICE, _FALL = 0.01, 10.0
 """Last price of nearness to the boundary [nats], of which a body costs four at most, and by how much it falls."""
 _STEPS, _CLOSE = 30, 0.1

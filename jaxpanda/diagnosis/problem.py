@@ -68,8 +68,10 @@ class Term:
 
     @functools.cached_property
     def body(self) -> Body | None:
-        """That the law's coefficients must be those of."""
-        return None if self.effect.body is None else body(*self.effect.body)
+        """That the law's coefficients must be those of; None for the tangent of a shape."""
+        if self.effect.body is None or len(self.deviation) != len(self.effect.coefficients):
+            return None
+        return body(self.effect.body)
 
     @property
     def width(self) -> int:

@@ -142,9 +142,9 @@ class AbstractEffect(eqx.Module):
         return self
 
     @property
-    def body(self) -> tuple[Float[np.ndarray, "10"], Float[np.ndarray, "10 n"]] | None:
-        r"""$\phi$ and D of standard parameters $\phi + D c$ that must be a body's, with the coefficients c; or
-        None."""
+    def body(self) -> Float[np.ndarray, "10 n"] | None:
+        """Standard parameters of each coefficient, of a law that adds a body: the first one's are a body's. A
+        change of a link is none: it stands for what torque tells of several links."""
         return None
 
     @property

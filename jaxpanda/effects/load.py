@@ -111,11 +111,6 @@ class InertialParameters(AbstractArmEffect):
         """Link, and what is added to its standard parameters."""
         return self.link, self._basis[0] @ c
 
-    @property
-    def body(self):
-        """The link as it is then."""
-        return np.array(self.standard), self._basis[0]
-
     def parameters(self, c, covariance) -> list[dict[str, Any]]:
         return _as_body(self, self._basis[0], c, covariance)
 
@@ -165,7 +160,7 @@ class Payload(AbstractArmEffect):
 
     @property
     def body(self):
-        return np.zeros(10), self._basis[0]
+        return self._basis[0]
 
     def parameters(self, c, covariance) -> list[dict[str, Any]]:
         return _as_body(self, self._basis[0], c, covariance)
@@ -246,7 +241,7 @@ class PayloadChange(AbstractArmEffect):
 
     @property
     def body(self):
-        return np.zeros(10), self._basis[0]
+        return self._basis[0]
 
     def carried(self, c: Numbers) -> tuple[int, Float[Array, "10"]] | None:
         return self.link, jnp.asarray(self._basis[0] @ c)
