@@ -225,16 +225,6 @@ class Design:
         return b, G
 
 
-def independent(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
-    r"""How many samples tell of a mean square, $n / (1 + 2 \sum \rho_k^2)$ (Bartlett 1946), lags up to where the
-    correlation has first changed its sign."""
-    n = len(x)
-    spectrum = np.abs(np.fft.rfft(x, 2 * n, axis=0)) ** 2
-    rho = np.fft.irfft(spectrum, axis=0)[:n] / np.maximum(np.sum(x**2, 0), 1e-300)
-    related = np.cumprod(rho > 0, 0)[1:] * rho[1:]
-    return np.count_nonzero(x, 0) / (1 + 2 * np.sum(related**2, 0))
-
-
 def gram(F: Float[np.ndarray, "rows m n"]) -> Float[np.ndarray, "m n n"]:
     """$F_m^\\top F_m$ of each m."""
     stacked = np.moveaxis(F, 1, 0)

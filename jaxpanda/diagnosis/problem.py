@@ -19,7 +19,7 @@ from ..errors import InputError
 from . import catchall
 from .bodies import Body, body
 from .discrepancy import of_law, unresolved, unresolved_known
-from .evidence import Design, Noise, OnDemand, independent
+from .evidence import Design, Noise, OnDemand
 from .host import parallel
 from .library import Candidates, build, columns_of
 from .noise import ORDER, QUIETEST, Saturation
@@ -362,8 +362,8 @@ class Problem:
                 for right in acting[: i + 1]:
                     H[place[left], place[right]] += here.product(left, right)
         H = np.tril(H) + np.tril(H, -1).T
-        for joint, told, nuisance, residual in self._resting:
-            A = np.concatenate([nuisance, *(told(t.at_joint(joint)) for t in terms)], 1)
+        for joint, picked, nuisance, residual in self._resting:
+            A = np.concatenate([nuisance, *(picked(t.at_joint(joint)) for t in terms)], 1)
             H += A.T @ A
             g += A.T @ residual
         precision = np.concatenate([np.ones(counts[0]), *(t.precision for t in terms)])
@@ -380,30 +380,22 @@ class Problem:
 
     @functools.cached_property
     def _resting(self) -> list[tuple[int, Callable, np.ndarray, np.ndarray]]:
-        """Joints that no recording tells noise of, as where friction holds them: what makes rows of their
+        """Joints that no recording tells noise of, as where friction holds them: what picks some rows of their
         columns, and the nuisance and the residual there, over the deviation of the torque.
 
-        It is off by as much as with the user's model. How much it is off in the mean tells as much as one sample;
-        how that changes, as many as are independent. Without that nothing bounds what models say there.
+        It is off by as much as with the user's model, and its rows together tell as much as one sample. Without
+        that models differ there in ways that nothing bounds.
         """
         joints = [j for j in range(self.dof) if not self.saturation.tells(j)]
         rows = np.unique(np.linspace(0, self.rows[-1].stop - 1, _PICKED).astype(int))
         each = [rows[(rows >= part.start) & (rows < part.stop)] - part.start for part in self.rows]
+        some = lambda parts: np.concatenate([x[k] for x, k in zip(parts, each, strict=True)])
         out = []
         for joint in joints:
-            whole = np.concatenate([r[:, joint] for r in self.residual])
-            changes = whole - whole.mean()
-            count = min(float(independent(changes[:, None])[0]), len(rows))
-            mean = max(float(np.sqrt(np.mean(whole**2))), QUIETEST)
-            spread = max(float(np.std(whole)), QUIETEST) * np.sqrt(len(rows) / max(count, 1.0))
-
-            def told(parts: Sequence, mean: float = mean, spread: float = spread) -> np.ndarray:
-                x = np.concatenate([part[k] for part, k in zip(parts, each, strict=True)])
-                middle = x.mean(0, keepdims=True)
-                return np.concatenate([middle / mean, (x - middle) / spread])
-
-            nuisance, residual = (told([x[:, joint] for x in of]) for of in (self.nuisance, self.residual))
-            out.append((joint, told, nuisance, residual))
+            residual = some([r[:, joint] for r in self.residual])
+            size = max(float(np.sqrt(np.mean(residual**2))), QUIETEST) * np.sqrt(len(rows))
+            nuisance = some([n[:, joint] for n in self.nuisance]) / size
+            out.append((joint, lambda parts, size=size: some(parts) / size, nuisance, residual / size))
         return out
 
     @functools.cached_property

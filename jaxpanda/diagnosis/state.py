@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from .evidence import Design, Noise, independent, levelled, stretches
+from .evidence import Design, Noise, levelled, stretches
 from .problem import Problem, Term
 
 
@@ -208,6 +208,16 @@ def likelier(a: tuple[Problem, State], b: tuple[Problem, State]) -> float:
     power = [np.maximum(np.sum(x**2, 0), 1e-300) for x in (left, other)]
     foretold = float(np.sum(0.5 * count * np.log(power[0] / power[1])))
     return b[1].score - a[1].score + foretold
+
+
+def independent(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
+    r"""How many samples tell of a mean square, $n / (1 + 2 \sum \rho_k^2)$ (Bartlett 1946), lags up to where the
+    correlation has first changed its sign."""
+    n = len(x)
+    spectrum = np.abs(np.fft.rfft(x, 2 * n, axis=0)) ** 2
+    rho = np.fft.irfft(spectrum, axis=0)[:n] / np.maximum(np.sum(x**2, 0), 1e-300)
+    related = np.cumprod(rho > 0, 0)[1:] * rho[1:]
+    return np.count_nonzero(x, 0) / (1 + 2 * np.sum(related**2, 0))
 
 
 def leftover(problem: Problem, state: State) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:

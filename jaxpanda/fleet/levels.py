@@ -14,11 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..diagnosis import Diagnosis
-from ..diagnosis.evidence import independent
 from ..diagnosis.knowledge import Knowledge
 from ..diagnosis.premises import pose
 from ..diagnosis.problem import Problem
-from ..diagnosis.state import places, with_terms
+from ..diagnosis.state import independent, places, with_terms
 from ..diagnosis.uncertainty import covariances
 from ..effects import AbstractEffect
 from ..effects.friction import CoulombFriction, ViscousFriction
