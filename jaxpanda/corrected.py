@@ -55,10 +55,6 @@ class Corrected(eqx.Module):
     """Up to which a prediction takes motion into account in each joint's torque [Hz], as that of the recordings
     showed it; None, or no entries: as far as q shows it."""
 
-    def below(self, cutoff: float | None) -> "Corrected":
-        """The same with that cutoff at every joint."""
-        return dataclasses.replace(self, cutoffs=(cutoff,) * self.arm.dof)
-
     @property
     def native(self) -> Arm:
         """The arm with every effect that MuJoCo's own attributes can hold, and the better-known numbers."""

@@ -36,7 +36,10 @@ def as_recorded(
         other = _compared(recordings, gear, noise)[1]
         if np.sum(np.log(squares(other) / squares(torque))) < 0:
             best, torque = gear, other
-    slower = [squares(_compared(recordings, best.below(cutoff), noise)[1]) for cutoff in CUTOFFS]
+    slower = []
+    for cutoff in CUTOFFS:
+        everywhere = dataclasses.replace(best, cutoffs=(cutoff,) * corrected.arm.dof)
+        slower.append(squares(_compared(recordings, everywhere, noise)[1]))
     least = np.min(slower, 0)
     # a smaller share may be noise of q, and another motion faster
     filtered = least < MOST * squares(torque)
@@ -52,7 +55,7 @@ def predicted(
     cutoffs = corrected.cutoffs or (None,) * corrected.arm.dof
     for cutoff in dict.fromkeys(cutoffs):
         trace = prepare(
-            recording, corrected.arm, whole=True, noise=noise, turning=corrected.turning, cutoff=cutoff
+            recording, corrected.arm, whole=True, noise=noise, turning=corrected.turning, below=cutoff
         )
         out[cutoff] = trace, corrected.measured_torque(trace.motion, trace.channels, trace.sign)
     torque = np.stack([out[cutoff][1][:, joint] for joint, cutoff in enumerate(cutoffs)], 1)

@@ -144,7 +144,11 @@ class Design:
         self.normal = normal
         self.information, self.g = normal[0] + np.diag(precision), normal[1]
         self.factor = scipy.linalg.cho_factor(self.information, lower=True) if len(self.g) else None
-        self.x, self.cost = self.admissible(self.solve(self.g), self.solve)
+        free = self.solve(self.g)
+        self.x, cost = self.admissible(free, self.solve)
+        self.fitted = (
+            0.5 * self.g @ free - cost
+        )  # by how much the data are likelier than without coefficients
 
     def admissible(
         self, x: Float[np.ndarray, " n"], solve: Callable[[np.ndarray], np.ndarray]
@@ -191,8 +195,7 @@ class Design:
         if self.factor is None:
             return 0.0
         half_determinant = np.log(np.diag(self.factor[0])).sum()
-        best = 0.5 * self.g @ self.solve(self.g) - self.cost
-        return float(best - half_determinant + 0.5 * np.log(self.precision).sum())
+        return float(self.fitted - half_determinant + 0.5 * np.log(self.precision).sum())
 
     def in_joint(
         self, joint: int, Phi: Float[np.ndarray, "rows m n"], G: Float[np.ndarray, "m n n"]

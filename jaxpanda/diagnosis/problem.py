@@ -526,17 +526,19 @@ def _left_out(
             dg += out.T @ missing
     found = []
     for dH, dg in less:
-        unit = 1 / np.sqrt(np.diag(H - dH))  # coefficients differ in size by their units
-        scaled = unit[:, None] * (H - dH) * unit
-        if not len(g):
+        if len(g):
+            solve = _solver(H - dH)
+            found.append(design.admissible(solve(g - dg), solve)[0])
+        else:
             found.append(g)
-            continue
-        factor = scipy.linalg.cho_factor(scaled, lower=True)
-        solve = lambda y, unit=unit, factor=factor: (
-            unit * scipy.linalg.cho_solve(factor, (unit * y.T).T).T
-        ).T  # fmt: skip
-        found.append(design.admissible(solve(g - dg), solve)[0])
     return found
+
+
+def _solver(H: Float[np.ndarray, "n n"]) -> Callable[[np.ndarray], np.ndarray]:
+    """Multiplies by $H^{-1}$, whose coefficients differ in size by their units."""
+    unit = 1 / np.sqrt(np.diag(H))
+    factor = scipy.linalg.cho_factor(unit[:, None] * H * unit, lower=True)
+    return lambda y: (unit * scipy.linalg.cho_solve(factor, (unit * y.T).T).T).T
 
 
 def key_of(effect: AbstractEffect) -> tuple:

@@ -177,7 +177,7 @@ def prepare(
     whole: bool = False,
     noise: Float[np.ndarray, " dof"] | None = None,
     turning: float | None = None,
-    cutoff: float | None = None,
+    below: float | None = None,
 ) -> Trace:
     """A recording on its two grids.
 
@@ -187,7 +187,7 @@ def prepare(
         whole: one grid for all, ends and gaps included, as prediction needs.
         noise: of the torque [N m], where the recording does not tell.
         turning: velocity over which the arm's Coulomb friction turns [rad/s]; None: as MuJoCo's constraint does.
-        cutoff: of the low-pass of q, where that is lower than what q shows [Hz].
+        below: low-pass of q, where that is lower than what q shows [Hz].
     """
     rough = signals_.prepare(recording, cutoff=3.0, rate=WORK_RATE, trim=0.0 if whole else TRIM)
     rate, time = rough.rate, rough.time
@@ -201,8 +201,8 @@ def prepare(
         cutoff_q = _clearest_cutoff(position, _least_step(recording.q), noise, arm, rate)
     else:
         cutoff_q = position_cutoff(position, noise, arm, rate)
-    if cutoff is not None:
-        cutoff_q = min(cutoff_q, cutoff)
+    if below is not None:
+        cutoff_q = min(cutoff_q, below)
     q, qd, qdd = _derivatives(position, cutoff_q, rate)
     width = _REST * _velocity_noise(_position_noise(position), cutoff_q, rate)
 
@@ -212,16 +212,16 @@ def prepare(
     thin = next(k for k in range(min(stride, thinnest), 0, -1) if stride % k == 0)
     fine = np.arange(keep[0] % thin, len(time), thin)
     kept, dt = (keep - fine[0]) // thin, thin / rate
-    cutoff_tau = min(0.4 * rate / stride, 0.45 * rate)
+    cutoff = min(0.4 * rate / stride, 0.45 * rate)
 
     sign = held_sign(arm, qd[fine], qdd[fine], width) if turning is None else np.tanh(qd[fine] / turning)
     doubtful = _unsure_sign(position, qd, width + _TURN * np.abs(qdd), cutoff_q, rate)[fine][kept]
     held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
     held, tau = held_fine[kept], None if rough.tau is None else rough.tau[keep]
     if stride > thin:
-        held = signals_.zero_phase(held_fine, cutoff_tau, 1 / dt)[kept]
+        held = signals_.zero_phase(held_fine, cutoff, 1 / dt)[kept]
     if stride > 1 and rough.tau is not None:
-        tau = signals_.zero_phase(rough.tau, cutoff_tau, rate)[keep]
+        tau = signals_.zero_phase(rough.tau, cutoff, rate)[keep]
     motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], held)
 
     def finely(x: np.ndarray) -> np.ndarray:
@@ -246,19 +246,7 @@ def prepare(
     for joint, start, stop in stuck:
         trust[(motion.time > start - _NEAR) & (motion.time < stop + _NEAR), joint] = 0.0
     return Trace(
-        recording.name,
-        rough,
-        channels,
-        dt,
-        motion,
-        tau,
-        weight,
-        kept,
-        cutoff_tau,
-        sign,
-        trust,
-        doubtful,
-        stuck,
+        recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust, doubtful, stuck
     )
 
 
