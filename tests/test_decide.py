@@ -6,6 +6,7 @@ What is known to fail is not run: `pytest -m slow --runxfail` tells whether it f
 import dataclasses
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import record
@@ -58,6 +59,24 @@ def test_crosstalk_carries_what_its_source_is_missing_too(tmp_path):
     assert later.tau is not None
     error = np.sqrt(np.mean((predict(tmp_path, motion) - later.tau)[100:-100, 3] ** 2))
     assert error < 0.06  # the noise is 0.05
+
+
+def test_friction_that_a_line_was_fitted_to_is_told_as_the_curve_it_is():
+    """It needs less of the model's Coulomb and viscous friction at once, and was a contact beside one of them."""
+    curve = lambda qd: 9.0 * np.sqrt(np.abs(qd)) * np.tanh(qd / 0.005)
+    speeds = np.linspace(0.02, 1.0, 50)
+    level, slope = np.linalg.lstsq(np.stack([np.ones(50), speeds], 1), curve(speeds))[0]
+    at = lambda value: jnp.zeros(7).at[3].set(value)
+    arm = dataclasses.replace(Arm.panda(), frictionloss=at(level), damping=at(slope))
+    one = record(30, lambda t, q, qd, qdd: curve(qd) * np.eye(7)[3])
+    problem = pose((prepare(one, arm),), (True,), "exact").problem
+    state = search(problem)
+    (term,) = (t for t in state.terms if 3 in t.effect.joints)
+    assert term.effect.title == "power_law_friction"
+    laws = with_terms(problem, [t.law for t in state.terms])
+    assert np.all(laws.design.x[places(laws)[state.terms.index(term)]][1:] < 0)  # of the line
+    left, users = problem.predicted_error(laws.design, laws.noise)
+    assert left < 0.2 * users
 
 
 def test_a_law_does_not_do_what_it_likes_at_joints_that_rest():

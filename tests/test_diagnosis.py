@@ -36,7 +36,7 @@ from jaxpanda.effects.drive import Backlash, JointElasticity
 from jaxpanda.effects.friction import FrictionDrift
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.motion import masses
-from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.effects.sensing import TorqueCrosstalk, TorqueOffset
 from jaxpanda.effects.stribeck import StribeckFriction
 from jaxpanda.export import panda_mjcf
 from jaxpanda.feasible.nearest import are_buildable
@@ -403,6 +403,25 @@ def test_what_fits_one_recording_only_is_left_out_of_the_corrected_model():
     ).problem
     terms = [same.term(TorqueOffset(1), np.array([1.0]))]
     assert len(transferable(same, with_terms(same, terms)).terms) == 1
+
+
+def test_crosstalk_is_worth_what_predicted_torque_explains():
+    """A vibration that the sensors of two joints show is not in the torque that is predicted of either."""
+
+    def shaken(t, q, qd, qdd):
+        return (np.sin(2 * np.pi * 2.3 * t) * np.cos(np.sqrt(3) * t))[:, None] * np.eye(7)[[0, 2]].sum(0)
+
+    def leaking(t, q, qd, qdd):
+        tau = Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)).load
+        return 0.1 * tau[:, 1:2] * np.eye(7)[2]
+
+    def kept(source, extra):
+        problem = pose((prepare(record(20, extra), Arm.panda()),), (True,), "exact").problem
+        state = with_terms(problem, [problem.term(TorqueCrosstalk(2, source), np.array([1.0]))])
+        return transferable(problem, state).terms
+
+    assert len(kept(1, leaking)) == 1
+    assert kept(0, shaken) == ()
 
 
 def test_friction_whose_parts_cancel_is_left_out_of_the_corrected_model():

@@ -131,6 +131,19 @@ def test_known_friction_far_below_the_noise_has_no_discrepancy():
     assert none.shape[2] == 0
 
 
+def test_known_damping_is_a_law_like_known_friction_of_coulombs_kind():
+    """Off by more at one speed than at another, in proportion to what it is there."""
+    arm = dataclasses.replace(Arm.panda(), damping=jnp.zeros(7).at[3].set(DAMPING))
+    trace = prepare(record(30), arm)
+    (off,) = of_known([trace], np.full(7, NOISE))
+    assert off.shape[2] > 0
+    assert not np.any(np.delete(off, 3, 1))
+    spread, torque = np.sqrt(np.sum(off[:, 3] ** 2, 1)), DAMPING * np.abs(trace.motion.qd[:, 3])
+    share = spread[torque > 10 * NOISE] / torque[torque > 10 * NOISE]
+    assert share.min() > 0.01
+    assert share.max() < 0.05
+
+
 def test_what_no_column_describes_is_a_share_of_the_torque_and_of_its_rate(quiet):
     trace = quiet.traces[0]
     steady = np.full((trace.motion.samples, 7), 2.0)

@@ -106,8 +106,13 @@ def unresolved(
 
 def unresolved_known(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
     """The same of the friction that the user's model holds; where it rests `Trace.trust` says."""
-    level = np.asarray(traces[0].motion.arm.frictionloss)
-    return _in_proportion(traces, [level * t.down(t.sign) for t in traces])
+    return _in_proportion(traces, [_known_friction(t) for t in traces])
+
+
+def _known_friction(trace: Trace) -> Float[np.ndarray, "_time dof"]:
+    """Of the user's model [N m]."""
+    arm = trace.motion.arm
+    return np.asarray(arm.frictionloss) * trace.down(trace.sign) + np.asarray(arm.damping) * trace.motion.qd
 
 
 def _in_proportion(traces: Sequence[Trace], torque: Torque) -> Float[np.ndarray, "rows dof"]:
@@ -137,16 +142,18 @@ def of_known(
     arm, dof = traces[0].motion.arm, traces[0].motion.dof
     samples = [t.motion.samples for t in traces]
     parts = [np.zeros((sum(samples), dof, 0))]
+    friction = np.concatenate([_known_friction(t) for t in traces])
     for j, level in enumerate(np.asarray(arm.frictionloss)):
+        off = []
         if KNOWN_TURN * level > SEEN * std[j]:
             sign = np.concatenate([t.down(t.sign[:, j]) for t in traces])
-            law = CoulombFriction
-            off = [KNOWN_TURN * level * (turning(traces, j) - sign[:, None])]
-            if law.discrepancy * level > SEEN * std[j]:
-                copies = (_hats(traces, j, channel) for channel in law.varies_with)
-                off += [law.discrepancy * level * sign[:, None] * copy for copy in copies]
-            values = np.concatenate(off, 1)
-            parts.append(values[:, None] * np.eye(dof)[j][:, None])
+            off.append(KNOWN_TURN * level * (turning(traces, j) - sign[:, None]))
+        law = CoulombFriction
+        if law.discrepancy * np.sqrt(np.mean(friction[:, j] ** 2)) > SEEN * std[j]:
+            copies = (_hats(traces, j, channel) for channel in law.varies_with)
+            off += [law.discrepancy * friction[:, j, None] * copy for copy in copies]
+        if off:
+            parts.append(np.concatenate(off, 1)[:, None] * np.eye(dof)[j][:, None])
     return np.split(np.concatenate(parts, 2), np.cumsum(samples)[:-1])
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from .. import signals as signals_
 from ..arm import Arm
-from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect
+from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect, Channels, Stretches, joint_columns
 from ..errors import InputError
 from . import catchall
 from .bodies import Body, body
@@ -448,15 +448,40 @@ class Problem:
         return self._mispredicted(design, self.spread_folds if spread else self.folds)
 
     def _mispredicted(self, design: Design, folds: Sequence) -> Float[np.ndarray, "rows dof"]:
-        """Not whitened: as whoever takes the model to predict torque would see it, slow errors count in full, and
-        what was put down to the encoders' noise does not help."""
+        """Not whitened: as whoever takes the model to predict torque would see it, slow errors count in full,
+        what was put down to the encoders' noise does not help, and of what sensors show there is only what is
+        predicted."""
         residual = np.concatenate(self.residual)
         parts = zip(self.nuisance, *(t.columns for t in design.terms), strict=True)
         columns = np.concatenate([np.concatenate(part, 2) for part in parts])
         out = np.zeros_like(residual)
-        for (_, test), x in zip(folds, _left_out(design, folds), strict=True):
-            out[test] = residual[test] - columns[test] @ self.explained(x, design.terms)
+        found = [self.explained(x, design.terms) for x in _left_out(design, folds)]
+        for (_, test), x in zip(folds, found, strict=True):
+            out[test] = residual[test] - columns[test] @ x
+        first = self.nuisance[0].shape[2]
+        for term in design.terms:
+            at = slice(first, first + len(term.deviation))
+            first = at.stop
+            if term.effect.takes_shown:
+                less = columns[:, :, at] - self._of_predicted(term.effect, out)
+                for (_, test), x in zip(folds, found, strict=True):
+                    out[test] += less[test] @ x[at]
         return out * np.concatenate([t.weights for t in self.traces])
+
+    def _of_predicted(
+        self, effect: AbstractEffect, wrong: Float[np.ndarray, "rows dof"]
+    ) -> Float[np.ndarray, "rows dof n"]:
+        """Columns of an effect of the torque that sensors show, made from what is predicted of it: all but what
+        is `wrong`."""
+        columns = np.zeros((*wrong.shape, len(effect.coefficients)))
+        for r, (trace, rows) in enumerate(zip(self.traces, self.rows, strict=True)):
+            motion = trace.motion
+            known = motion.q, motion.qd, motion.qdd, motion.load, trace.tau - trace.residual
+            channels = Channels(motion.time, *known, shown=trace.tau - wrong[rows])
+            for here in self.placed([effect], r):
+                values = joint_columns([here], Stretches(channels), motion.dt)  # pyright: ignore
+                columns[rows, here.joints[0]] = values[:, 0]
+        return columns
 
     @functools.cached_property
     def saturation(self) -> Saturation:

@@ -32,6 +32,16 @@ PROPORTIONAL = 1.25
 """Exponent of the speed, or one over it, up to which friction is called proportional to it."""
 
 
+LEVEL, SLOPE = Coefficient("coulomb", "N·m"), Coefficient("damping", "N·m·s/rad")
+"""Of a law in the place of the friction that the user's model holds: by how much that friction is off."""
+
+
+def has_friction(arm: Arm) -> list[int]:
+    """Joints whose friction the user's model holds already."""
+    held = (np.asarray(arm.frictionloss) > 0) | (np.asarray(arm.damping) > 0)
+    return np.flatnonzero(held).tolist()
+
+
 class ViscousFriction(AbstractInstantEffect):
     r"""Friction proportional to velocity, $\tau_j = F_v\,\dot q_j$.
 
@@ -115,7 +125,8 @@ class PowerLawFriction(AbstractDryFriction):
     r"""Friction that grows with a power of the speed, $\tau_j = F_p\,|\dot q_j|^p \tanh(\dot q_j / v_0)$.
 
     Churned oil takes p near 2, a warm film of grease p below 1; with p near 1 it is viscous friction, and called
-    so.
+    so. Form "instead" is for a joint whose model holds friction already: numbers fitted to a line are wrong for a
+    curve, so it comes with corrections of both, $F_c \tanh(\dot q_j / v_0) + F_v\,\dot q_j$.
 
     References:
         Olsson, Åström, Canudas de Wit, Gäfvert, Lischinsky, European Journal of Control 1998.
@@ -131,26 +142,39 @@ class PowerLawFriction(AbstractDryFriction):
     joint: Joint
     exponent: Float[Array, ""] | float
     v0: Float[Array, ""] | float = 0.005
+    form: str = eqx.field(static=True, default="")
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["PowerLawFriction"]:
-        return [cls(joint=j, exponent=p) for p in (0.5, 0.7, 1.5, 2.0, 2.5) for j in range(arm.dof)]
+        exponents = (0.5, 0.7, 1.5, 2.0, 2.5)
+        alone = [cls(joint=j, exponent=p) for p in exponents for j in range(arm.dof)]
+        return alone + [
+            cls(joint=j, exponent=p, form="instead") for p in exponents for j in has_friction(arm)
+        ]
 
     @property
     def title(self) -> str:
         proportional = 1 / PROPORTIONAL < float(self.exponent) < PROPORTIONAL
-        return ViscousFriction.name if proportional else self.name
+        return ViscousFriction.name if proportional and not self.form else self.name
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("friction_at_unit_speed", "N·m", sign=1),)
+        law = Coefficient("friction_at_unit_speed", "N·m", sign=1)
+        return (law, LEVEL, SLOPE) if self.form else (law,)
 
     @property
     def equation(self) -> str:
-        return "tau = friction_at_unit_speed * |dq|^exponent * sign(dq)"
+        law = "friction_at_unit_speed * |dq|^exponent * sign(dq)"
+        return f"tau = {law}" + (" + coulomb * sign(dq) + damping * dq" if self.form else "")
 
     def levels(self, s: Channels) -> Float[Array, " n"]:
-        return ((jnp.abs(s.qd[self.joint]) + 1e-9) ** self.exponent)[None]
+        level = (jnp.abs(s.qd[self.joint]) + 1e-9) ** self.exponent
+        return jnp.stack([level, jnp.ones_like(level), jnp.zeros_like(level)] if self.form else [level])
+
+    def remainder(self, s: Channels) -> Float[Array, " n"]:
+        qd = s.qd[self.joint]
+        none = jnp.zeros_like(qd)
+        return jnp.stack([none, none, qd] if self.form else [none])
 
 
 class AsymmetricFriction(AbstractDryFriction):
@@ -269,7 +293,8 @@ class LoadDependentFriction(AbstractDryFriction):
     $\tau_{load}$ is the torque of the rigid arm at the joint, p is near 1. A gear's teeth carry the friction as
     well as the load, $F = \mu\,|\tau_{load} + F|$: more where the motor drives the load ($\mu/(1 - \mu)$) than
     where the load drives the motor ($\mu/(1 + \mu)$), which is $\kappa$. The words of `form` say what is there
-    beside $\mu$: "coulomb" $F_c$, "directed" $\kappa$, "viscous" $\nu$.
+    beside $\mu$: "coulomb" $F_c$, "instead" the same of either sign for a joint whose model holds some,
+    "directed" $\kappa$, "viscous" $\nu$.
 
     References:
         Bittencourt et al., IROS 2010; Duclusaud et al., arXiv 2410.08650.
@@ -291,9 +316,9 @@ class LoadDependentFriction(AbstractDryFriction):
     def grid(cls, arm: Arm) -> Sequence["LoadDependentFriction"]:
         return [
             cls(j, v0, 1.0, form)
-            for form in ("", "coulomb")
+            for form in ("", "coulomb", "instead")
             for v0 in (0.004, 0.02, 0.06)
-            for j in range(arm.dof)
+            for j in (has_friction(arm) if form == "instead" else range(arm.dof))
         ]
 
     @property
@@ -306,13 +331,16 @@ class LoadDependentFriction(AbstractDryFriction):
         return tuple(of_words[w] for w in self.form.split() if w in of_words)
 
     def variants(self, arm: Arm) -> Sequence["LoadDependentFriction"]:
-        forms = ("directed", "coulomb directed", "viscous", "directed viscous")
+        forms = ["directed", "coulomb directed", "viscous", "directed viscous"]
+        if self.joint in has_friction(arm):
+            forms.append("instead directed")
         return [dataclasses.replace(self, form=form) for form in forms if form != self.form]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
         of_words = {
             "coulomb": Coefficient("coulomb", "N·m", sign=1),
+            "instead": LEVEL,
             "directed": Coefficient("load_asymmetry", "1"),
             "viscous": Coefficient("load_damping", "s/rad"),
         }
@@ -321,7 +349,7 @@ class LoadDependentFriction(AbstractDryFriction):
     @property
     def equation(self) -> str:
         words = self.form.split()
-        level = "coulomb + " if "coulomb" in words else ""
+        level = "coulomb + " if {"coulomb", "instead"} & set(words) else ""
         factor = (
             "(load_coefficient + load_asymmetry * sign(tau_load * dq))"
             if "directed" in words
@@ -341,6 +369,7 @@ class LoadDependentFriction(AbstractDryFriction):
         loaded = self._loaded(s)
         of_words = {
             "coulomb": jnp.ones_like(loaded),
+            "instead": jnp.ones_like(loaded),
             "directed": loaded * jnp.sign(s.load[self.joint]) * smooth_sign(s.qd[self.joint], self.v0),
             "viscous": jnp.zeros_like(loaded),
         }

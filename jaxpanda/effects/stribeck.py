@@ -16,7 +16,7 @@ from .effect import (
     Seconds,
     Shape,
 )
-from .friction import CoulombFriction, ViscousFriction
+from .friction import LEVEL, SLOPE, CoulombFriction, ViscousFriction, has_friction
 from .memory import bristle, turned
 from .motion import Channels, Joint
 
@@ -29,7 +29,8 @@ class StribeckFriction(AbstractDryFriction):
 
     $$\tau_j = \left(F_c + (F_s - F_c)\,e^{-(|\dot q_j|/v_s)^\delta}\right) \tanh(\dot q_j / v_0)$$
 
-    Form "extra" leaves out $F_c$, for a joint whose model holds it already.
+    Form "extra" leaves out $F_c$, for a joint whose model holds it already; "instead" has $F_c$ and a damping of
+    either sign there, by which numbers fitted to a line are wrong for a curve.
 
     References:
         Armstrong-Hélouvry 1991; Olsson et al., European Journal of Control 1998.
@@ -55,11 +56,11 @@ class StribeckFriction(AbstractDryFriction):
     def grid(cls, arm: Arm) -> Sequence["StribeckFriction"]:
         return [
             cls(j, vs, v0, exponent, form)
-            for form in ("whole", "extra", "viscous")
-            for exponent in ((1.0, 2.0) if form != "viscous" else (2.0,))
+            for form in ("whole", "extra", "viscous", "instead")
+            for exponent in ((1.0, 2.0) if form in ("whole", "extra") else (2.0,))
             for vs in (0.02, 0.05, 0.1, 0.2, 0.35)
             for v0 in ((0.004, 0.02) if vs > 0.03 else (0.004,))
-            for j in range(arm.dof)
+            for j in (has_friction(arm) if form == "instead" else range(arm.dof))
         ]
 
     def variants(self, arm: Arm) -> Sequence[AbstractEffect]:
@@ -80,23 +81,34 @@ class StribeckFriction(AbstractDryFriction):
     def coefficients(self) -> tuple[Coefficient, ...]:
         level, excess = Coefficient("coulomb", "N·m", sign=1), Coefficient("static_excess", "N·m", sign=1)
         slope = Coefficient("damping", "N·m·s/rad", sign=1)
-        return {"whole": (level, excess), "extra": (excess,), "viscous": (level, excess, slope)}[self.form]
+        return {
+            "whole": (level, excess),
+            "extra": (excess,),
+            "viscous": (level, excess, slope),
+            "instead": (LEVEL, excess, SLOPE),
+        }[self.form]
 
     @property
     def equation(self) -> str:
         bump = "static_excess * exp(-(|dq| / stribeck_velocity)^exponent)"
         law = bump if self.form == "extra" else f"(coulomb + {bump})"
-        return f"tau = {law} * tanh(dq / v0)" + (" + damping * dq" if self.form == "viscous" else "")
+        return f"tau = {law} * tanh(dq / v0)" + (
+            " + damping * dq" if self.form in ("viscous", "instead") else ""
+        )
 
     def levels(self, s: Channels) -> Float[Array, " n"]:
         bump = _excess(self, s)
         one, none = jnp.ones_like(bump), jnp.zeros_like(bump)
-        return jnp.stack({"whole": [one, bump], "extra": [bump], "viscous": [one, bump, none]}[self.form])
+        with_slope = [one, bump, none]
+        parts = {"whole": [one, bump], "extra": [bump], "viscous": with_slope, "instead": with_slope}
+        return jnp.stack(parts[self.form])
 
     def remainder(self, s: Channels) -> Float[Array, " n"]:
         qd = s.qd[self.joint]
         none = jnp.zeros_like(qd)
-        return jnp.stack({"whole": [none, none], "extra": [none], "viscous": [none, none, qd]}[self.form])
+        with_slope = [none, none, qd]
+        parts = {"whole": [none, none], "extra": [none], "viscous": with_slope, "instead": with_slope}
+        return jnp.stack(parts[self.form])
 
 
 class StribeckBristles(AbstractMemoryEffect):
