@@ -9,8 +9,10 @@ import scipy.signal
 
 from jaxpanda import Arm, Recording
 from jaxpanda.corrected import Corrected
-from jaxpanda.diagnosis.as_recorded import GEAR, as_recorded, predicted
+from jaxpanda.diagnosis.as_recorded import GEAR, as_recorded, misleading, predicted
 from jaxpanda.diagnosis.traces import held_sign, prepare
+from jaxpanda.effects.drive import Armature
+from jaxpanda.effects.friction import ViscousFriction
 
 NOISE = np.full(7, 0.02)
 
@@ -66,3 +68,21 @@ def test_prediction_takes_no_more_of_fast_motion_than_the_torque_showed():
     error = lambda corrected: np.std(predicted(faster, corrected, NOISE)[1] - faster.tau, axis=0)
     assert np.all(error(found)[[1, 3]] < 0.8 * error(plain)[[1, 3]])
     np.testing.assert_array_equal(np.delete(error(found), [1, 3]), np.delete(error(plain), [1, 3]))
+
+
+def test_effects_that_make_the_recordings_own_torque_worse_are_named():
+    """An armature that is not there follows the sharp turns; damping that is there stays beside it."""
+    arm = dataclasses.replace(Arm.panda(), damping=jnp.full(7, 0.5))
+    recording, zeros = reversing(arm, (), 6.0), jnp.zeros(7)
+    lacking = Corrected(Arm.panda(), jnp.zeros((7, 10)), zeros, zeros, (), ())
+    damped = tuple(ViscousFriction(j) for j in range(7)), (jnp.array([0.5]),) * 7
+    right = dataclasses.replace(lacking, effects=damped[0], coefficients=damped[1])
+    assert misleading([recording], right, NOISE, 7) == set()
+    wrong = dataclasses.replace(
+        right,
+        effects=(*damped[0], Armature(5, "signed")),
+        coefficients=(*damped[1], jnp.array([0.02])),
+    )
+    assert misleading([recording], wrong, NOISE, 8) == {7}
+    assert misleading([recording], wrong, NOISE, 1) == {0}
+    assert misleading([recording], lacking, NOISE, 0) == set()

@@ -47,6 +47,34 @@ def as_recorded(
     return dataclasses.replace(best, cutoffs=tuple(cutoffs) if any(filtered) else ())
 
 
+def misleading(
+    recordings: Sequence[Recording], corrected: Corrected, noise: Float[np.ndarray, " dof"], count: int
+) -> set[int]:
+    """Which of the last `count` effects make the recordings' own torque be predicted worse.
+
+    A search compares motion and torque below the frequency up to which both are known; a prediction shows all of
+    the motion. What only fitted the slow part is no law of this arm.
+    """
+    measured, torque = _compared(recordings, corrected, noise)
+    squares = lambda x: np.maximum(np.sum((measured - x) ** 2, 0), 1e-300)
+    first = len(corrected.effects) - count
+    own = {}
+    for i in range(count):
+        effects, values = list(corrected.effects), list(corrected.coefficients)
+        del effects[first + i], values[first + i]
+        less = dataclasses.replace(corrected, effects=tuple(effects), coefficients=tuple(values))
+        own[i] = torque - _compared(recordings, less, noise)[1]
+    gone = set[int]()
+    while own:
+        costs = {i: np.sum(np.log(squares(torque - part) / squares(torque))) for i, part in own.items()}
+        worst = min(costs, key=lambda i: costs[i])
+        if costs[worst] >= 0:
+            break
+        torque = torque - own.pop(worst)
+        gone.add(worst)
+    return gone
+
+
 def predicted(
     recording: Recording, corrected: Corrected, noise: Float[np.ndarray, " dof"]
 ) -> tuple[Trace, Float[np.ndarray, "time dof"]]:

@@ -31,7 +31,7 @@ _TOUCHING = 0.15
 _LISTED = 0.01
 """Probability from which a rival is listed."""
 DOUBTFUL = 0.2
-"""Confidence below which what a finding stands for counts as not explained."""
+"""Confidence below which what a finding stands for counts as not explained, where it is large."""
 REFITTED = 0.9
 """Confidence that a model's numbers are wrong, where their refit explains what differs and nothing else does."""
 

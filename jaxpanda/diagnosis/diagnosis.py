@@ -33,7 +33,7 @@ from ..recordings import Recording, distinct, load
 from ..session import Say, silent
 from . import knowledge as knowledge_
 from . import saved
-from .as_recorded import as_recorded, predicted
+from .as_recorded import as_recorded, misleading, predicted
 from .calibration import calibrated
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
@@ -238,22 +238,23 @@ def diagnose(
     progress("refining the numbers, and weighing what else it could be")
     state = polished(problem, state)
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
-    kept = transferable(problem, laws)
-    lost = [all(t is not k for k in kept.terms) for t in laws.terms]
-    found = tuple(findings(problem, state, laws, lost))
     contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
     wrong = numbers(problem, state, premises.changes) if contradicted else []
-    found = (*found, *wrong)
+    kept, quiet = transferable(problem, laws), problem.noise(()).std
     corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
-    corrected = _buildable(source, corrected, problem)
-    corrected = as_recorded(in_question, corrected, problem.noise(()).std)
+    if worse := misleading(in_question, corrected, quiet, len(kept.terms)):
+        kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
+        corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
+    corrected = as_recorded(in_question, _buildable(source, corrected, problem), quiet)
+    lost = [all(t is not k for k in kept.terms) for t in laws.terms]
+    found = (*findings(problem, state, laws, lost), *wrong)
     fitted = fit(problem, kept)
     if any(lost):
         dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
         premises = dataclasses.replace(
             premises,
             notes=(*premises.notes, "left out of the corrected model, as torque is predicted no better with it"
-                   f" where it was not fitted: {', '.join(sorted(dropped))}"),
+                   f" where it was not fitted, or with all of the motion: {', '.join(sorted(dropped))}"),
         )  # fmt: skip
     # numbers that only moved within what they were uncertain by stay as the user wrote them
     written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
@@ -433,7 +434,9 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
     if not names:
         return "consistent"
     if "unknown" not in names:
-        doubtful = any(f.confidence < DOUBTFUL for f in found)
+        doubtful = any(
+            f.confidence < DOUBTFUL and np.any(f.rms_torque > MISSED * fit.noise_floor) for f in found
+        )
         missed = bool(np.any(fit.held_out_rmse_after > MISSED * fit.noise_floor))
         unsure = missed and all(f.confidence < UNSURE for f in found)
         held_out = fit.held_out_rmse_before, fit.held_out_rmse_after
