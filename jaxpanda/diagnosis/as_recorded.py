@@ -55,15 +55,21 @@ def misleading(
     A search compares motion and torque below the frequency up to which both are known; a prediction shows all of
     the motion. What only fitted the slow part is no law of this arm.
     """
-    measured, torque = _compared(recordings, corrected, noise)
+    traces = [predicted(recording, corrected, noise)[0] for recording in recordings]
+    counts = np.concatenate([t.weight > 0 for t in traces])
+    measured = np.concatenate([np.asarray(t.tau) for t in traces])[counts]
     squares = lambda x: np.maximum(np.sum((measured - x) ** 2, 0), 1e-300)
+
+    def predicted_by(one: Corrected) -> Float[np.ndarray, "rows dof"]:
+        return np.concatenate([one.measured_torque(t.motion, t.channels, t.sign) for t in traces])[counts]
+
+    torque, own = predicted_by(corrected), {}
     first = len(corrected.effects) - count
-    own = {}
     for i in range(count):
         effects, values = list(corrected.effects), list(corrected.coefficients)
         del effects[first + i], values[first + i]
         less = dataclasses.replace(corrected, effects=tuple(effects), coefficients=tuple(values))
-        own[i] = torque - _compared(recordings, less, noise)[1]
+        own[i] = torque - predicted_by(less)
     gone = set[int]()
     while own:
         costs = {i: np.sum(np.log(squares(torque - part) / squares(torque))) for i, part in own.items()}
