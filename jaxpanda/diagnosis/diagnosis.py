@@ -241,10 +241,11 @@ def diagnose(
     contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
     wrong = numbers(problem, state, premises.changes) if contradicted else []
     kept, quiet = transferable(problem, laws), problem.noise(()).std
-    corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
+    correct = lambda state: _corrected(arm, premises, state, refitted=bool(state.terms or wrong))
+    corrected = correct(kept)
     if worse := misleading(in_question, corrected, quiet, len(kept.terms)):
         kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
-        corrected = _corrected(arm, premises, kept, refitted=bool(kept.terms or wrong))
+        corrected = correct(kept)
     corrected = as_recorded(in_question, _buildable(source, corrected, problem), quiet)
     lost = [all(t is not k for k in kept.terms) for t in laws.terms]
     found = (*findings(problem, state, laws, lost), *wrong)

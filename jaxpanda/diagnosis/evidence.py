@@ -146,9 +146,8 @@ class Design:
         self.factor = scipy.linalg.cho_factor(self.information, lower=True) if len(self.g) else None
         free = self.solve(self.g)
         self.x, cost = self.admissible(free, self.solve)
-        self.fitted = (
-            0.5 * self.g @ free - cost
-        )  # by how much the data are likelier than without coefficients
+        # by how much the data are likelier than without coefficients
+        self.fitted = 0.5 * self.g @ free - cost
 
     def admissible(
         self, x: Float[np.ndarray, " n"], solve: Callable[[np.ndarray], np.ndarray]
