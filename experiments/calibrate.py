@@ -21,8 +21,10 @@ from jaxpanda.diagnosis.calibration import WEIGHTS, features, weight_of
 
 FOLDS = 10
 RIDGE = 3.0
-"""On what the weights differ by from those of today, which are of hundreds of findings of earlier trials: a few
-dozen cases correct them."""
+"""On what the weights differ by from those of today, which are of hundreds of findings: a few dozen cases correct
+them."""
+SIGNS = (0, 1, 1, 1, 1, -1)
+"""Of the weights: more of what speaks for a finding never makes less sure."""
 
 
 def judged(case: Path, answer: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -32,8 +34,11 @@ def judged(case: Path, answer: Path) -> tuple[np.ndarray, np.ndarray]:
     findings, places = said["findings"], truth_places(truth)
     if not findings:
         return np.zeros((0, len(WEIGHTS))), np.zeros(0)
-    sizes = np.array([f["rms_torque"] for f in findings]) / said["fit"]["noise_floor"]
-    first, *others = features(sizes, said["verdict"] == "explained").T
+    fit = said["fit"]
+    sizes = np.array([f["rms_torque"] for f in findings])
+    sizes /= np.maximum(fit["held_out_rmse_after"], fit["noise_floor"])
+    foretold = [f["evidence_nats"] if f["held_out_nats"] is None else f["held_out_nats"] for f in findings]
+    first, *others = features(sizes, np.array(foretold), said["verdict"] == "explained").T
     weight = [weight_of(f["confidence"] if f.get("posterior") is None else f["posterior"]) for f in findings]
     right = np.array([is_right(places, f) for f in findings])
     allowed = [all(is_allowed(truth, claim) for claim in claims_of(f)) for f in findings]
@@ -43,12 +48,13 @@ def judged(case: Path, answer: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def fitted(x: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Weights of the logistic regression, near those of today."""
-    sign, today = 2 * right - 1, np.array(WEIGHTS)
+    way, today = 2 * right - 1, np.array(WEIGHTS)
 
     def loss(w: np.ndarray) -> float:
-        return float(np.logaddexp(0, -sign * (x @ w)).sum() + RIDGE * np.sum((w - today) ** 2))
+        return float(np.logaddexp(0, -way * (x @ w)).sum() + RIDGE * np.sum((w - today) ** 2))
 
-    return minimize(loss, today).x
+    bounds = [(0.0 if sign > 0 else None, 0.0 if sign < 0 else None) for sign in SIGNS]
+    return minimize(loss, today, bounds=bounds).x
 
 
 def report(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> str:

@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 
 from jaxpanda.diagnosis.calibration import calibrated
-from jaxpanda.diagnosis.finding import Finding
+from jaxpanda.diagnosis.finding import Finding, Fit
 
 NOISE = np.array([0.1, 0.2])
 
 
-def found(rms_torque, confidence=0.9, alternatives=(("armature", 0.08),)):
+def errors(held_out):
+    """A fit that leaves so much where it was not fitted, in noise of `NOISE`."""
+    return Fit(2 * held_out, held_out, 2 * held_out, held_out, NOISE)
+
+
+def found(rms_torque, confidence=0.9, alternatives=(("armature", 0.08),), foretold=30.0):
     return Finding(
         effect="viscous_friction",
         joints=(0,),
@@ -25,11 +30,12 @@ def found(rms_torque, confidence=0.9, alternatives=(("armature", 0.08),)):
         evidence=10.0,
         summary="",
         terms=(0,),
+        foretold=foretold,
     )
 
 
-def sure(findings, verdict="explained"):
-    return [f.confidence for f in calibrated(findings, verdict, NOISE)]
+def sure(findings, verdict="explained", held_out=NOISE):
+    return [f.confidence for f in calibrated(findings, verdict, errors(held_out))]
 
 
 def test_a_law_that_makes_up_its_joint_is_surer_than_one_that_is_small_beside_it():
@@ -43,10 +49,33 @@ def test_nothing_is_as_sure_where_something_stays_unexplained():
     assert partly < explained - 0.1
 
 
+def test_torque_that_is_small_beside_what_stays_wrong_elsewhere_is_doubted():
+    clear, small = (sure([found([1.0, 0.0])], held_out=np.array([x, 0.2]))[0] for x in (0.1, 1.0))
+    assert small < clear - 0.3
+
+
+def test_what_does_not_help_where_it_was_not_fitted_is_doubted():
+    helps, nothing, misleads = (sure([found([1.0, 0.0], foretold=x)])[0] for x in (30.0, 0.0, -30.0))
+    assert helps > nothing + 0.1 > misleads + 0.2
+
+
+def test_of_what_foretells_nothing_the_evidence_counts():
+    (of_evidence,), (foretold,) = (
+        sure([found([1.0, 0.0], foretold=None)]),
+        sure([found([1.0, 0.0], foretold=10.0)]),
+    )
+    assert of_evidence == foretold
+
+
+def test_a_held_out_error_below_the_noise_counts_as_noise():
+    below, at = (sure([found([1.0, 0.0])], held_out=x * NOISE) for x in (0.5, 1.0))
+    assert below == at
+
+
 def test_the_weight_is_kept_and_probabilities_of_a_place_add_up_to_one_at_most():
     for weight in (0.0, 0.1, 0.6, 0.995):
         before = found([1.0, 0.0], weight, (("armature", 1 - weight),))
-        (after,) = calibrated([before], "explained", NOISE)
+        (after,) = calibrated([before], "explained", errors(NOISE))
         assert after.posterior == weight
         assert 0 < after.confidence <= 0.995
         assert after.confidence + sum(p for _, p in after.alternatives) <= 1 + 1e-12
@@ -65,4 +94,4 @@ def test_more_weight_and_more_torque_never_make_less_sure(verdict):
 
 
 def test_nothing_found_stays_nothing():
-    assert calibrated([], "consistent", NOISE) == []
+    assert calibrated([], "consistent", errors(NOISE)) == []

@@ -1,5 +1,6 @@
 """From accepted terms to findings: merged, weighed against their rivals, and said in words."""
 
+import functools
 from collections import Counter
 from collections.abc import Callable, Sequence
 
@@ -15,7 +16,7 @@ from .calibration import SUREST
 from .finding import Finding, joined
 from .problem import Problem, Term
 from .search import posterior
-from .state import State, leftover, places, without
+from .state import State, foretelling, leftover, places, without
 from .uncertainty import covariances
 from .unnamed import hum, standing_off, stuck
 
@@ -36,7 +37,13 @@ REFITTED = 0.9
 """Confidence that a model's numbers are wrong, where their refit explains what differs and nothing else does."""
 
 
-def findings(problem: Problem, state: State, laws: State, lost: Sequence[bool]) -> list[Finding]:
+def findings(
+    problem: Problem,
+    state: State,
+    laws: State,
+    lost: Sequence[bool],
+    weighed: dict[int, dict[str, float]] | None = None,
+) -> list[Finding]:
     """The accepted terms as findings, those that explain most first.
 
     Args:
@@ -44,13 +51,20 @@ def findings(problem: Problem, state: State, laws: State, lost: Sequence[bool]) 
         state: the likeliest model.
         laws: the same without discrepancy, as the corrected model has them: what is told of torque and numbers.
         lost: which of its terms predict torque no better where they were not fitted.
+        weighed: probability of each effect in a term's place, by the terms' ids, where it is known; others are
+            added.
     """
-    rivals = [_rivals(problem, state, i) for i in range(len(state.terms))]
+    weighed = {} if weighed is None else weighed
+    rivals = [_rivals(problem, state, i, weighed) for i in range(len(state.terms))]
     groups = together(problem, state.terms)
     names = titles(state.terms)
     doubt = np.where(lost, MISLEADS, 1.0)
     spread = covariances(problem, state)
-    out = [_finding(problem, laws, group, names[group[0]], rivals, doubt, spread) for group in groups]
+    helps = foretold(problem, laws, groups)
+    out = [
+        _finding(problem, laws, group, names[group[0]], rivals, doubt, spread, gained)
+        for group, gained in zip(groups, helps, strict=True)
+    ]
     # what is in the band of the search belongs to what was found there
     lowest = {"lowest": problem.traces[0].cutoff} if out else {}
     halted = stuck(problem, state.noise.std)
@@ -164,11 +178,15 @@ def _same(problem: Problem, a: Term, b: Term) -> bool:
     return a.effect.joints == b.effect.joints or len(_intervals(problem, [a, b])) == 1
 
 
-def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, float], float]:
+def _rivals(
+    problem: Problem, state: State, i: int, weighed: dict[int, dict[str, float]]
+) -> tuple[float, dict[str, float], float]:
     """Evidence of a term, probability of each effect in its place, its own included."""
+    term = state.terms[i]
     evidence = state.design.log_evidence - without(state, i).log_evidence
-    probability = posterior(problem, state, i)
-    return evidence, probability, probability.get(state.terms[i].effect.title, 0.0)
+    probability = weighed.get(id(term)) or posterior(problem, state, i)
+    weighed[id(term)] = probability
+    return evidence, probability, probability.get(term.effect.title, 0.0)
 
 
 def coefficients(state: State, i: int) -> Float[np.ndarray, " n"]:
@@ -190,6 +208,7 @@ def _finding(
     rivals: Sequence,
     doubt: Float[np.ndarray, " terms"],
     covariance: Sequence[Float[np.ndarray, "_n _n"]],
+    gained: float,
 ) -> Finding:
     terms = [state.terms[i] for i in members]
     effect = next((t.effect for t in terms if t.effect.name == name), terms[0].effect)
@@ -241,7 +260,30 @@ def _finding(
         terms=tuple(members),
         kind=getattr(terms[0].effect, "form", ""),
         own_family=effect.family,
+        foretold=gained,
     )
+
+
+def foretold(problem: Problem, laws: State, groups: Sequence[Sequence[int]]) -> list[float]:
+    r"""By how much likelier the terms of each group make the torque of blocks that nothing was fitted to [nats].
+
+    $\tfrac12 \sum_j n_j \log (s^2_j / S^2_j)$ with S² the mean square error beside all terms, s² without the
+    group, and $n_j$ independent samples of either.
+    """
+
+    @functools.cache
+    def whole(spread: bool) -> Float[np.ndarray, "rows dof"]:
+        return problem.mispredicted(laws.design, spread=spread)
+
+    out = []
+    for group in groups:
+        effects = [laws.terms[i].effect for i in group]
+        spread = any(e.drifts or e.bound_to_recording for e in effects)
+        rest = laws.design
+        for i in sorted(group, reverse=True):
+            rest = rest.without(i)
+        out.append(foretelling(problem.mispredicted(rest, spread=spread), whole(spread)))
+    return out
 
 
 def _intervals(problem: Problem, terms: Sequence[Term]) -> tuple[tuple[float, float], ...]:

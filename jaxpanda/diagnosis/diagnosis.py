@@ -55,6 +55,8 @@ from .unnamed import BEYOND
 NEXT_MOTION = "next_motion.csv"
 UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""
+TOLD = 0.1
+"""Confidence from which something is told."""
 UNSURE, MISSED = 0.6, 2.0
 """Confidence that no finding reaches, and held-out error over the noise, where not all is taken for explained."""
 
@@ -238,54 +240,135 @@ def diagnose(
     progress("refining the numbers, and weighing what else it could be")
     state = polished(problem, state)
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
-    contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
-    wrong = numbers(problem, state, premises.changes) if contradicted else []
-    kept, quiet = transferable(problem, laws), problem.noise(()).std
-    correct = lambda state: _corrected(arm, premises, state, refitted=bool(state.terms or wrong))
-    corrected = correct(kept)
-    if worse := misleading(in_question, corrected, quiet, len(kept.terms)):
-        kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
-        corrected = correct(kept)
-    corrected = as_recorded(in_question, _buildable(source, corrected, problem), quiet)
-    lost = [all(t is not k for k in kept.terms) for t in laws.terms]
-    found = (*findings(problem, state, laws, lost), *wrong)
-    fitted = fit(problem, kept)
-    if any(lost):
-        dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
-        premises = dataclasses.replace(
-            premises,
-            notes=(*premises.notes, "left out of the corrected model, as torque is predicted no better with it"
-                   f" where it was not fitted, or with all of the motion: {', '.join(sorted(dropped))}"),
-        )  # fmt: skip
+    conclude = functools.partial(
+        _concluded, premises=premises, source=source, recordings=in_question, weighed={},
+        contradicted=premises.knowledge != knowledge,
+    )  # fmt: skip
+    told, notes = conclude(state, laws), list(premises.notes)
+    while unsure := [f for f in told.findings if f.terms and f.confidence < TOLD]:
+        notes.append(_too_unsure(unsure))
+        log.append(notes[-1])
+        gone = {i for f in unsure for i in f.terms}
+        state, laws = (
+            with_terms(problem, [t for i, t in enumerate(of.terms) if i not in gone])
+            for of in (told.state, told.laws)
+        )
+        told = conclude(state, laws)
+    if any(told.lost):
+        terms = zip(told.state.terms, told.lost, strict=True)
+        dropped = {t.effect.name.replace("_", " ") for t, gone in terms if gone}
+        notes.append(
+            "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
+            f" or with all of the motion: {', '.join(sorted(dropped))}"
+        )
+    corrected = as_recorded(in_question, told.corrected, problem.noise(()).std)
     # numbers that only moved within what they were uncertain by stay as the user wrote them
-    written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
+    written, warnings = _written(source, corrected if told.refitted else corrected.as_written, problem)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
-    answer = verdict(found, fitted, partly(problem, state) or not all(_judged(problem)))
     return Diagnosis(
-        verdict=answer,
-        findings=tuple(calibrated(found, answer, fitted.noise_floor)),
-        fit=fitted,
+        verdict=told.verdict,
+        findings=told.findings,
+        fit=told.fit,
         corrected=corrected,
         written=written,
         notes=(
-            *premises.notes,
+            *notes,
             *repairs,
             *(n for t in traces for n in _still(t)),
             *_unheard(problem),
-            *_turned(problem, state),
+            *_turned(problem, told.state),
             *_as_recorded(corrected),
             *(n for t in traces for n in t.signals.notes),
             *warnings,
         ),
         log=tuple(log),
         problem=problem,
-        state=state,
+        state=told.state,
         source=source,
         knowledge=premises.knowledge,
         spread=premises.spread,
-        kept=kept,
+        kept=told.kept,
         scale=premises.scale,
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Concluded:
+    """What follows from some terms."""
+
+    state: State
+    laws: State
+    """The same without discrepancy."""
+    kept: State
+    lost: tuple[bool, ...]
+    """Which of the terms the corrected model does without."""
+    corrected: Corrected
+    findings: tuple[Finding, ...]
+    fit: Fit
+    verdict: str
+    refitted: bool
+    """Whether the model's own numbers are among the findings."""
+
+
+def _concluded(
+    state: State,
+    laws: State,
+    *,
+    premises: Premises,
+    source: MjcfSource,
+    recordings: Sequence[Recording],
+    weighed: dict[int, dict[str, float]],
+    contradicted: bool,
+) -> _Concluded:
+    """Corrected model, findings and verdict.
+
+    Args:
+        state: the terms.
+        laws: the same without discrepancy.
+        premises: what they were found on.
+        source: the user's model.
+        recordings: those in question.
+        weighed: rivals of terms, by the terms' ids, where they are known; others are added.
+        contradicted: whether the recordings say that the model's numbers are known less well than was supposed.
+    """
+    problem, arm = premises.problem, premises.problem.arm
+    # an identification by a poorer motion is no finding
+    wrong = numbers(problem, state, premises.changes) if contradicted else []
+    kept, quiet = transferable(problem, laws), problem.noise(()).std
+
+    def correct(by: State) -> Corrected:
+        return _corrected(arm, premises, by, refitted=bool(by.terms or wrong))
+
+    corrected = correct(kept)
+    if worse := misleading(recordings, corrected, quiet, len(kept.terms)):
+        kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
+        corrected = correct(kept)
+    lost = tuple(all(t is not k for k in kept.terms) for t in laws.terms)
+    found = (*findings(problem, state, laws, lost, weighed), *wrong)
+    fitted = fit(problem, kept)
+    answer = verdict(found, fitted, partly(problem, state) or not all(_judged(problem)))
+    return _Concluded(
+        state=state,
+        laws=laws,
+        kept=kept,
+        lost=lost,
+        corrected=_buildable(source, corrected, problem),
+        findings=tuple(calibrated(found, answer, fitted)),
+        fit=fitted,
+        verdict=answer,
+        refitted=bool(wrong),
+    )
+
+
+def _too_unsure(findings: Sequence[Finding]) -> str:
+    """A sentence about findings that are not told."""
+    each = []
+    for f in findings:
+        joints = ", ".join(str(j + 1) for j in f.joints)
+        each.append(
+            f"{f.effect.replace('_', ' ')} at joint{'s' * (len(f.joints) > 1)} {joints} ({f.confidence:.2f})"
+        )
+    return f"left out, as it is hardly likely to be what is missing: {'; '.join(each)}"
 
 
 class _Log(list[str]):

@@ -37,7 +37,9 @@ class Finding:
     """Weight among the models compared, of which `calibration` made the confidence."""
     kind: str = ""
     """Which form of the effect; "" where it has one."""
-
+    foretold: float | None = None
+    """By how much likelier it makes torque that its coefficients were not fitted to [nats]; None where it has
+    none."""
     own_family: str = "unknown"
     """Of an effect that `FAMILIES` does not have."""
 
@@ -61,6 +63,7 @@ class Finding:
             "parameters": [dict(p) for p in self.parameters],
             "rms_torque": [float(v) for v in self.rms_torque],
             "evidence_nats": self.evidence,
+            "held_out_nats": self.foretold,
             "summary": self.summary,
         }
 

@@ -197,17 +197,24 @@ def evidence(problem: Problem, terms: Sequence[Term], design: Design, noise: Noi
 def likelier(a: tuple[Problem, State], b: tuple[Problem, State]) -> float:
     r"""By how much the second of two models of the same recordings is likelier than the first [nats].
 
-    To what the models' evidence tells is added what they predict on blocks that they were not fitted to,
-    $\tfrac12 \sum_j n_j \log (s^2_{a,j}/s^2_{b,j})$ with $n_j$ independent samples of an error whose mean square
-    is $s^2_j$: innovations, of which evidence is made, tell little of slow errors, and free forms fit them in
-    ways that hold nowhere else.
+    To what the models' evidence tells is added what they predict on blocks that they were not fitted to
+    (`foretelling`): innovations, of which evidence is made, tell little of slow errors, and free forms fit them
+    in ways that hold nowhere else.
     """
     drifts = any(t.effect.drifts for _, state in (a, b) for t in state.terms)
     left, other = (problem.mispredicted(state.design, spread=drifts) for problem, state in (a, b))
+    return b[1].score - a[1].score + foretelling(left, other)
+
+
+def foretelling(left: Float[np.ndarray, "rows dof"], other: Float[np.ndarray, "rows dof"]) -> float:
+    r"""By how much likelier a model is that leaves `other` than one that leaves `left` where neither was fitted.
+
+    $\tfrac12 \sum_j n_j \log (s^2_{\text{left},j}/s^2_{\text{other},j})$ [nats] with $n_j$ independent samples of
+    an error whose mean square is $s^2_j$.
+    """
     count = np.minimum(independent(left), independent(other))
     power = [np.maximum(np.sum(x**2, 0), 1e-300) for x in (left, other)]
-    foretold = float(np.sum(0.5 * count * np.log(power[0] / power[1])))
-    return b[1].score - a[1].score + foretold
+    return float(np.sum(0.5 * count * np.log(power[0] / power[1])))
 
 
 def independent(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
