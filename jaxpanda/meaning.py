@@ -93,8 +93,8 @@ _OWN = 0.6
 """Deviation of the logarithm of motors' constants about their common one."""
 _TOLD = 10.0
 """Angle from the model's gravity beyond which a mounting is told [degrees]."""
-_LIGHTEST = 0.8
-"""Gravity below which it is taken for removed [m/s²]: the moon's is 1.6."""
+_EARTH, _MOON = 9.81, 1.62
+"""Sizes of gravity [m/s²]."""
 _UNITS = {name: 1 / size for name, size in UNITS.items() if name not in ("Nm", "lbfft", "kgfm", "Nmm")}
 """Units that torque is written in, each per N·m; lbf·ft is too near to a gain to be told, kgf·m to current."""
 _GEARS = 30.0, 400.0
@@ -615,27 +615,52 @@ def _order_prior(order: Int[np.ndarray, " dof"]) -> float:
 
 
 def _mountings(model: _Model) -> list[_Reading]:
-    r"""Gravity fitted freely, $g \sim N(0, 9.81^2)$, with links' errors turned along; by Laplace's method."""
-    size, dof = 9.81, model.arm.dof
-    expected = max(float(np.linalg.norm(model.gravity)), 1e-9)
-    current, score, g = model, -np.inf, model.gravity
+    """Gravity of another direction, or the moon's along the model's: its size is known wherever an arm stands."""
+    size, one, order = float(np.linalg.norm(model.gravity)), np.ones(model.arm.dof), np.arange(model.arm.dof)
+    out = []
+    if size:
+        moon = _MOON / size * model.gravity
+        score = np.log(_RARE * _PRIOR) + _Model(model.arm, model.samples, model.order, moon).evidence()
+        out.append(_Reading("mounting", score, one, order, gravity=moon))
+    g, evidence = _turned(model, size or _EARTH)
+    if _angle(g, model.gravity) >= _TOLD or not size:
+        out.append(_Reading("mounting", np.log(_PRIOR) + evidence, one, order, gravity=g))
+    return out
+
+
+def _turned(model: _Model, size: float) -> tuple[Float[np.ndarray, "3"], float]:
+    r"""The likeliest gravity of some size [m/s²], all directions likely alike, and the evidence of that [nats].
+
+    With links' errors turned along; by Laplace's method in the plane that touches the sphere there.
+    """
+    current, g, K = model, model.gravity, np.eye(3)
     for _ in range(3):
-        H, h = np.eye(3) / size**2, np.zeros(3)
+        H, h = np.zeros((3, 3)), np.zeros(3)
         for j in model.moving:
             H, h = _informed(current, j, H, h)
-        g = np.linalg.solve(H, h)
-        if _angle(g, model.gravity) < 0.5 * _TOLD and 0.7 < np.linalg.norm(g) / expected < 1.4:
-            return []  # no other mounting
+        g, K = _on_sphere(H, h, size)
         current = _Model(model.arm, model.samples, model.order, g)
-        occam = -0.5 * float(np.linalg.slogdet(H * size**2)[1]) - 0.5 * float(g @ g) / size**2
-        score = np.log(_PRIOR) + current.evidence() + occam
-    if np.linalg.norm(g) < _LIGHTEST:
-        return []
-    if _angle(g, model.gravity) < _TOLD and 0.5 * expected < np.linalg.norm(g) < 2 * expected:
-        return []
-    if np.linalg.norm(g) < 0.5 * expected:
-        score += np.log(_RARE)
-    return [_Reading("mounting", score, np.ones(dof), np.arange(dof), gravity=g)]
+    plane = _across(g)
+    # of all directions, of 4 pi size², the recording leaves 2 pi / sqrt(det)
+    left = -np.log(2 * size**2) - 0.5 * float(np.linalg.slogdet(plane.T @ K @ plane)[1])
+    return g, current.evidence() + min(left, 0.0)
+
+
+def _on_sphere(
+    H: Float[np.ndarray, "3 3"], h: Float[np.ndarray, "3"], size: float
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    r"""The g of that size that maximises $h^\top g - \tfrac12 g^\top H g$, and $K = H + \mu$ with $K g = h$."""
+    values, V = np.linalg.eigh(H)
+    along = V.T @ h
+
+    def beyond(step: float) -> float:  # |g| falls from infinity to nothing
+        return float(np.linalg.norm(along / (values - values[0] + step)) - size)
+
+    most = float(np.linalg.norm(along)) / size + 1e-9
+    least = 1e-12 * max(most, float(values[-1]))
+    step = scipy.optimize.brentq(beyond, least, most) if beyond(least) > 0 > beyond(most) else least
+    g = V @ (along / (values - values[0] + step))
+    return g * (size / max(float(np.linalg.norm(g)), 1e-300)), H + (step - values[0]) * np.eye(3)
 
 
 def _informed(model: _Model, j: int, H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -646,7 +671,7 @@ def _informed(model: _Model, j: int, H: np.ndarray, h: np.ndarray) -> tuple[np.n
         A, y = turned @ G, turned @ r
         w = 1 / _totals(variances, model.size[j])
         HA, hA = np.einsum("na,nb,nh->hab", A, A, w), np.einsum("na,n,nh->ha", A, y, w)
-        K = HA + np.eye(3) / 9.81**2
+        K = HA + np.eye(3) / _EARTH**2
         fit = np.einsum("ha,ha->h", hA, np.linalg.solve(K, hA[..., None])[..., 0])
         said.append(0.5 * (fit - y**2 @ w + np.sum(np.log(w), 0) - determinant - np.linalg.slogdet(K)[1]))
         found.append((HA, hA))
@@ -765,4 +790,4 @@ def _mounted(g: np.ndarray, model: np.ndarray) -> str:
         return f"{vector}, {size:.2g} m/s² in size, as on the moon"
     what = f"tilted by {angle:.0f} degrees"
     what = "on a ceiling" if angle > 150 else "on a wall" if 70 < angle < 110 else what
-    return f"{vector}, as {what}" if angle >= _TOLD else f"{vector}, of another size"
+    return f"{vector}, as {what}"
