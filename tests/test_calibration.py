@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxpanda.diagnosis.calibration import calibrated
+from jaxpanda.diagnosis.calibration import calibrated, is_told
 from jaxpanda.diagnosis.finding import Finding, Fit
 
 NOISE = np.array([0.1, 0.2])
@@ -16,7 +16,7 @@ def errors(held_out):
     return Fit(2 * held_out, held_out, 2 * held_out, held_out, NOISE)
 
 
-def found(rms_torque, confidence=0.9, alternatives=(("armature", 0.08),), foretold=30.0):
+def found(rms_torque, confidence=0.9, alternatives=(("armature", 0.08),), foretold: float | None = 30.0):
     return Finding(
         effect="viscous_friction",
         joints=(0,),
@@ -70,6 +70,13 @@ def test_of_what_foretells_nothing_the_evidence_counts():
 def test_a_held_out_error_below_the_noise_counts_as_noise():
     below, at = (sure([found([1.0, 0.0])], held_out=x * NOISE) for x in (0.5, 1.0))
     assert below == at
+
+
+def test_what_is_small_and_hardly_likely_is_not_told():
+    fit = errors(3 * NOISE)
+    assert not is_told(found([0.2, 0.5], confidence=0.05), fit)
+    assert is_told(found([0.2, 0.5], confidence=0.2), fit)
+    assert is_told(found([0.2, 0.7], confidence=0.05), fit)
 
 
 def test_the_weight_is_kept_and_probabilities_of_a_place_add_up_to_one_at_most():

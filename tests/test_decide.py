@@ -14,7 +14,7 @@ from helpers import record
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.credible import is_of_time
-from jaxpanda.diagnosis.decide import findings
+from jaxpanda.diagnosis.decide import findings, foretold
 from jaxpanda.diagnosis.diagnosis import Fit, verdict
 from jaxpanda.diagnosis.events import windows
 from jaxpanda.diagnosis.finding import Finding
@@ -334,6 +334,17 @@ def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_hardly_believe
     assert (sure.effect, lost.effect) == ("coulomb_friction", "coulomb_friction")
     assert sure.confidence > 0.9
     assert lost.confidence <= 0.1
+
+
+def test_a_law_foretells_torque_where_it_is_there_and_none_where_it_is_not():
+    problem = posed(record(7, lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) == 1)))
+    both = [problem.term(CoulombFriction(j, 0.01), np.array([0.5])) for j in (1, 4)]
+    there, absent = foretold(problem, with_terms(problem, both), [[0], [1]])
+    assert there > 20
+    assert absent < 1
+    (of_finding,) = findings(problem, alone := with_terms(problem, both[:1]), alone, [False])
+    assert of_finding.foretold == pytest.approx(there, rel=0.2)
+    assert of_finding.to_json()["held_out_nats"] == of_finding.foretold
 
 
 @pytest.mark.slow

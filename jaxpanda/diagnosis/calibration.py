@@ -28,6 +28,8 @@ WEIGHTS = (-1.12, 0.05, 0.56, 2.55, 0.89, -1.32)
 """$w_0 \\ldots w_5$."""
 SUREST = 0.995
 """No finding is surer."""
+TOLD = 0.1
+"""Confidence from which something small is told."""
 _LEAST_SHARE, _LEAST_SIZE = 1e-4, 1e-2
 
 
@@ -42,11 +44,20 @@ def calibrated(findings: Sequence[Finding], verdict: str, fit: Fit) -> list[Find
     """
     if not findings:
         return []
-    error = np.maximum(fit.held_out_rmse_after, fit.noise_floor)
-    sizes = np.stack([f.rms_torque for f in findings]) / error
+    sizes = np.stack([f.rms_torque for f in findings]) / _error(fit)
     foretold = [f.evidence if f.foretold is None else f.foretold for f in findings]
     x = features(sizes, np.array(foretold), verdict == "explained")
     return [_calibrated(f, of_one) for f, of_one in zip(findings, x, strict=True)]
+
+
+def is_told(finding: Finding, fit: Fit) -> bool:
+    """Whether a finding is likely enough to be right, or larger than what the model gets wrong anyway."""
+    return finding.confidence >= TOLD or bool(np.any(finding.rms_torque > _error(fit)))
+
+
+def _error(fit: Fit) -> Float[np.ndarray, " dof"]:
+    """Of torque that nothing was fitted to, and no less than the noise [N m]."""
+    return np.maximum(fit.held_out_rmse_after, fit.noise_floor)
 
 
 def features(

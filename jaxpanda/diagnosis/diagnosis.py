@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from ..session import Say, silent
 from . import knowledge as knowledge_
 from . import saved
 from .as_recorded import as_recorded, misleading, predicted
-from .calibration import calibrated
+from .calibration import calibrated, is_told
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import Finding, Fit
@@ -55,8 +55,6 @@ from .unnamed import BEYOND
 NEXT_MOTION = "next_motion.csv"
 UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""
-TOLD = 0.1
-"""Confidence from which something is told."""
 UNSURE, MISSED = 0.6, 2.0
 """Confidence that no finding reaches, and held-out error over the noise, where not all is taken for explained."""
 
@@ -241,21 +239,16 @@ def diagnose(
     state = polished(problem, state)
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
     conclude = functools.partial(
-        _concluded, premises=premises, source=source, recordings=in_question, weighed={},
+        _concluded, premises, state, laws, source=source, recordings=in_question, weighed={},
         contradicted=premises.knowledge != knowledge,
     )  # fmt: skip
-    told, notes = conclude(state, laws), list(premises.notes)
-    while unsure := [f for f in told.findings if f.terms and f.confidence < TOLD]:
+    told, notes = conclude(), list(premises.notes)
+    if unsure := [f for f in told.findings if f.terms and not is_told(f, told.fit)]:
         notes.append(_too_unsure(unsure))
         log.append(notes[-1])
-        gone = {i for f in unsure for i in f.terms}
-        state, laws = (
-            with_terms(problem, [t for i, t in enumerate(of.terms) if i not in gone])
-            for of in (told.state, told.laws)
-        )
-        told = conclude(state, laws)
+        told = conclude(untold={i for f in unsure for i in f.terms})
     if any(told.lost):
-        terms = zip(told.state.terms, told.lost, strict=True)
+        terms = zip(state.terms, told.lost, strict=True)
         dropped = {t.effect.name.replace("_", " ") for t, gone in terms if gone}
         notes.append(
             "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
@@ -276,14 +269,14 @@ def diagnose(
             *repairs,
             *(n for t in traces for n in _still(t)),
             *_unheard(problem),
-            *_turned(problem, told.state),
+            *_turned(problem, state),
             *_as_recorded(corrected),
             *(n for t in traces for n in t.signals.notes),
             *warnings,
         ),
         log=tuple(log),
         problem=problem,
-        state=told.state,
+        state=state,
         source=source,
         knowledge=premises.knowledge,
         spread=premises.spread,
@@ -294,14 +287,11 @@ def diagnose(
 
 @dataclasses.dataclass(frozen=True)
 class _Concluded:
-    """What follows from some terms."""
+    """What follows from the terms of a model."""
 
-    state: State
-    laws: State
-    """The same without discrepancy."""
     kept: State
     lost: tuple[bool, ...]
-    """Which of the terms the corrected model does without."""
+    """Which of the terms that are told the corrected model does without."""
     corrected: Corrected
     findings: tuple[Finding, ...]
     fit: Fit
@@ -311,30 +301,33 @@ class _Concluded:
 
 
 def _concluded(
+    premises: Premises,
     state: State,
     laws: State,
     *,
-    premises: Premises,
     source: MjcfSource,
     recordings: Sequence[Recording],
     weighed: dict[int, dict[str, float]],
     contradicted: bool,
+    untold: Collection[int] = (),
 ) -> _Concluded:
     """Corrected model, findings and verdict.
 
     Args:
+        premises: what the terms were found on.
         state: the terms.
         laws: the same without discrepancy.
-        premises: what they were found on.
         source: the user's model.
         recordings: those in question.
         weighed: rivals of terms, by the terms' ids, where they are known; others are added.
         contradicted: whether the recordings say that the model's numbers are known less well than was supposed.
+        untold: terms that are no findings, and not in the corrected model.
     """
     problem, arm = premises.problem, premises.problem.arm
     # an identification by a poorer motion is no finding
     wrong = numbers(problem, state, premises.changes) if contradicted else []
-    kept, quiet = transferable(problem, laws), problem.noise(()).std
+    told = [t for i, t in enumerate(laws.terms) if i not in untold]
+    kept, quiet = transferable(problem, with_terms(problem, told) if untold else laws), problem.noise(()).std
 
     def correct(by: State) -> Corrected:
         return _corrected(arm, premises, by, refitted=bool(by.terms or wrong))
@@ -343,15 +336,15 @@ def _concluded(
     if worse := misleading(recordings, corrected, quiet, len(kept.terms)):
         kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
         corrected = correct(kept)
-    lost = tuple(all(t is not k for k in kept.terms) for t in laws.terms)
-    found = (*findings(problem, state, laws, lost, weighed), *wrong)
-    fitted = fit(problem, kept)
+    lost = [all(t is not k for k in kept.terms) for t in laws.terms]
+    found = [
+        f for f in findings(problem, state, laws, lost, weighed) if not f.terms or f.terms[0] not in untold
+    ]
+    found, fitted = [*found, *wrong], fit(problem, kept)
     answer = verdict(found, fitted, partly(problem, state) or not all(_judged(problem)))
     return _Concluded(
-        state=state,
-        laws=laws,
         kept=kept,
-        lost=lost,
+        lost=tuple(gone and i not in untold for i, gone in enumerate(lost)),
         corrected=_buildable(source, corrected, problem),
         findings=tuple(calibrated(found, answer, fitted)),
         fit=fitted,
@@ -364,11 +357,9 @@ def _too_unsure(findings: Sequence[Finding]) -> str:
     """A sentence about findings that are not told."""
     each = []
     for f in findings:
-        joints = ", ".join(str(j + 1) for j in f.joints)
-        each.append(
-            f"{f.effect.replace('_', ' ')} at joint{'s' * (len(f.joints) > 1)} {joints} ({f.confidence:.2f})"
-        )
-    return f"left out, as it is hardly likely to be what is missing: {'; '.join(each)}"
+        where = f"joint{'s' * (len(f.joints) > 1)} {', '.join(str(j + 1) for j in f.joints)}"
+        each.append(f"{f.effect.replace('_', ' ')} at {where} ({f.confidence:.2f})")
+    return f"left out, as it is small and hardly likely to be what is missing: {'; '.join(each)}"
 
 
 class _Log(list[str]):
