@@ -622,14 +622,15 @@ def _mountings(model: _Model) -> list[_Reading]:
         moon = _MOON / size * model.gravity
         score = np.log(_RARE * _PRIOR) + _Model(model.arm, model.samples, model.order, moon).evidence()
         out.append(_Reading("mounting", score, one, order, gravity=moon))
-    g, evidence = _turned(model, size or _EARTH)
-    if _angle(g, model.gravity) >= _TOLD or not size:
+    if (turned := _turned(model, size or _EARTH)) is not None:
+        g, evidence = turned
         out.append(_Reading("mounting", np.log(_PRIOR) + evidence, one, order, gravity=g))
     return out
 
 
-def _turned(model: _Model, size: float) -> tuple[Float[np.ndarray, "3"], float]:
-    r"""The likeliest gravity of some size [m/s²], all directions likely alike, and the evidence of that [nats].
+def _turned(model: _Model, size: float) -> tuple[Float[np.ndarray, "3"], float] | None:
+    r"""The likeliest gravity of some size [m/s²], all directions likely alike, and the evidence of that [nats];
+    None where that is the model's.
 
     With links' errors turned along; by Laplace's method in the plane that touches the sphere there.
     """
@@ -639,7 +640,11 @@ def _turned(model: _Model, size: float) -> tuple[Float[np.ndarray, "3"], float]:
         for j in model.moving:
             H, h = _informed(current, j, H, h)
         g, K = _on_sphere(H, h, size)
+        if np.any(model.gravity) and _angle(g, model.gravity) < 0.5 * _TOLD:
+            return None
         current = _Model(model.arm, model.samples, model.order, g)
+    if np.any(model.gravity) and _angle(g, model.gravity) < _TOLD:
+        return None
     plane = _across(g)
     # of all directions, of 4 pi size², the recording leaves 2 pi / sqrt(det)
     left = -np.log(2 * size**2) - 0.5 * float(np.linalg.slogdet(plane.T @ K @ plane)[1])
@@ -788,6 +793,8 @@ def _mounted(g: np.ndarray, model: np.ndarray) -> str:
     vector = f"gravity is about ({g[0]:.2f}, {g[1]:.2f}, {g[2]:.2f}) m/s² in its base"
     if size < 0.5 * expected:
         return f"{vector}, {size:.2g} m/s² in size, as on the moon"
+    if expected == 0:
+        return f"{vector}, where the model has none"
     what = f"tilted by {angle:.0f} degrees"
     what = "on a ceiling" if angle > 150 else "on a wall" if 70 < angle < 110 else what
     return f"{vector}, as {what}"
