@@ -74,9 +74,9 @@ def test_a_held_out_error_below_the_noise_counts_as_noise():
 
 def test_what_is_small_and_hardly_likely_is_not_told():
     fit = errors(3 * NOISE)
-    assert not is_told(found([0.2, 0.5], confidence=0.05), fit)
-    assert is_told(found([0.2, 0.5], confidence=0.2), fit)
-    assert is_told(found([0.2, 0.7], confidence=0.05), fit)
+    assert not is_told(found([0.15, 0.3], confidence=0.05), fit)
+    assert is_told(found([0.15, 0.3], confidence=0.2), fit)
+    assert is_told(found([0.15, 0.5], confidence=0.05), fit)
 
 
 def test_the_weight_is_kept_and_probabilities_of_a_place_add_up_to_one_at_most():

@@ -28,8 +28,8 @@ WEIGHTS = (-1.12, 0.05, 0.56, 2.55, 0.89, -1.32)
 """$w_0 \\ldots w_5$."""
 SUREST = 0.995
 """No finding is surer."""
-TOLD = 0.1
-"""Confidence from which something small is told."""
+TOLD, SMALL = 0.1, 2.0
+"""Confidence from which something small is told, and torque over the noise up to which it is small."""
 _LEAST_SHARE, _LEAST_SIZE = 1e-4, 1e-2
 
 
@@ -51,8 +51,8 @@ def calibrated(findings: Sequence[Finding], verdict: str, fit: Fit) -> list[Find
 
 
 def is_told(finding: Finding, fit: Fit) -> bool:
-    """Whether a finding is likely enough to be right, or larger than what the model gets wrong anyway."""
-    return finding.confidence >= TOLD or bool(np.any(finding.rms_torque > _error(fit)))
+    """Whether a finding is likely enough to be right, or large."""
+    return finding.confidence >= TOLD or bool(np.any(finding.rms_torque > SMALL * fit.noise_floor))
 
 
 def _error(fit: Fit) -> Float[np.ndarray, " dof"]:

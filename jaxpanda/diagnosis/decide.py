@@ -37,13 +37,7 @@ REFITTED = 0.9
 """Confidence that a model's numbers are wrong, where their refit explains what differs and nothing else does."""
 
 
-def findings(
-    problem: Problem,
-    state: State,
-    laws: State,
-    lost: Sequence[bool],
-    weighed: dict[int, dict[str, float]] | None = None,
-) -> list[Finding]:
+def findings(problem: Problem, state: State, laws: State, lost: Sequence[bool]) -> list[Finding]:
     """The accepted terms as findings, those that explain most first.
 
     Args:
@@ -51,11 +45,8 @@ def findings(
         state: the likeliest model.
         laws: the same without discrepancy, as the corrected model has them: what is told of torque and numbers.
         lost: which of its terms predict torque no better where they were not fitted.
-        weighed: probability of each effect in a term's place, by the terms' ids, where it is known; others are
-            added.
     """
-    weighed = {} if weighed is None else weighed
-    rivals = [_rivals(problem, state, i, weighed) for i in range(len(state.terms))]
+    rivals = [_rivals(problem, state, i) for i in range(len(state.terms))]
     groups = together(problem, state.terms)
     names = titles(state.terms)
     doubt = np.where(lost, MISLEADS, 1.0)
@@ -178,15 +169,11 @@ def _same(problem: Problem, a: Term, b: Term) -> bool:
     return a.effect.joints == b.effect.joints or len(_intervals(problem, [a, b])) == 1
 
 
-def _rivals(
-    problem: Problem, state: State, i: int, weighed: dict[int, dict[str, float]]
-) -> tuple[float, dict[str, float], float]:
+def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, float], float]:
     """Evidence of a term, probability of each effect in its place, its own included."""
-    term = state.terms[i]
     evidence = state.design.log_evidence - without(state, i).log_evidence
-    probability = weighed.get(id(term)) or posterior(problem, state, i)
-    weighed[id(term)] = probability
-    return evidence, probability, probability.get(term.effect.title, 0.0)
+    probability = posterior(problem, state, i)
+    return evidence, probability, probability.get(state.terms[i].effect.title, 0.0)
 
 
 def coefficients(state: State, i: int) -> Float[np.ndarray, " n"]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from ..session import Say, silent
 from . import knowledge as knowledge_
 from . import saved
 from .as_recorded import as_recorded, misleading, predicted
-from .calibration import calibrated, is_told
+from .calibration import SMALL, calibrated, is_told
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import Finding, Fit
@@ -55,8 +55,8 @@ from .unnamed import BEYOND
 NEXT_MOTION = "next_motion.csv"
 UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""
-UNSURE, MISSED = 0.6, 2.0
-"""Confidence that no finding reaches, and held-out error over the noise, where not all is taken for explained."""
+UNSURE = 0.6
+"""Confidence that no finding reaches where not all is taken for explained."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -238,30 +238,42 @@ def diagnose(
     progress("refining the numbers, and weighing what else it could be")
     state = polished(problem, state)
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
-    conclude = functools.partial(
-        _concluded, premises, state, laws, source=source, recordings=in_question, weighed={},
-        contradicted=premises.knowledge != knowledge,
-    )  # fmt: skip
-    told, notes = conclude(), list(premises.notes)
-    if unsure := [f for f in told.findings if f.terms and not is_told(f, told.fit)]:
-        notes.append(_too_unsure(unsure))
-        log.append(notes[-1])
-        told = conclude(untold={i for f in unsure for i in f.terms})
-    if any(told.lost):
-        terms = zip(state.terms, told.lost, strict=True)
-        dropped = {t.effect.name.replace("_", " ") for t, gone in terms if gone}
+    contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
+    wrong = numbers(problem, state, premises.changes) if contradicted else []
+    kept, quiet = transferable(problem, laws), problem.noise(()).std
+    correct = lambda by: _corrected(arm, premises, by, refitted=bool(by.terms or wrong))
+    corrected = correct(kept)
+    if worse := misleading(in_question, corrected, quiet, len(kept.terms)):
+        kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
+        corrected = correct(kept)
+    lost = [all(t is not k for k in kept.terms) for t in laws.terms]
+    found, fitted = [*findings(problem, state, laws, lost), *wrong], fit(problem, kept)
+    more = partly(problem, state) or not all(_judged(problem))
+    answer = verdict(found, fitted, more)
+    told, notes = calibrated(found, answer, fitted), list(premises.notes)
+    small = [bool(f.terms) and not is_told(f, fitted) for f in told]
+    if any(small):
+        notes.append(_too_unsure([f for f, untold in zip(told, small, strict=True) if untold]))
+        found = [f for f, untold in zip(found, small, strict=True) if not untold]
+        if not found:  # the user's model is as good as any
+            kept = with_terms(problem, ())
+            corrected, fitted = correct(kept), fit(problem, kept)
+        answer = verdict(found, fitted, more)
+        told = calibrated(found, answer, fitted)
+    if any(lost):
+        dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
         notes.append(
             "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
             f" or with all of the motion: {', '.join(sorted(dropped))}"
         )
-    corrected = as_recorded(in_question, told.corrected, problem.noise(()).std)
+    corrected = as_recorded(in_question, _buildable(source, corrected, problem), quiet)
     # numbers that only moved within what they were uncertain by stay as the user wrote them
-    written, warnings = _written(source, corrected if told.refitted else corrected.as_written, problem)
+    written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
-        verdict=told.verdict,
-        findings=told.findings,
-        fit=told.fit,
+        verdict=answer,
+        findings=tuple(told),
+        fit=fitted,
         corrected=corrected,
         written=written,
         notes=(
@@ -280,76 +292,8 @@ def diagnose(
         source=source,
         knowledge=premises.knowledge,
         spread=premises.spread,
-        kept=told.kept,
-        scale=premises.scale,
-    )
-
-
-@dataclasses.dataclass(frozen=True)
-class _Concluded:
-    """What follows from the terms of a model."""
-
-    kept: State
-    lost: tuple[bool, ...]
-    """Which of the terms that are told the corrected model does without."""
-    corrected: Corrected
-    findings: tuple[Finding, ...]
-    fit: Fit
-    verdict: str
-    refitted: bool
-    """Whether the model's own numbers are among the findings."""
-
-
-def _concluded(
-    premises: Premises,
-    state: State,
-    laws: State,
-    *,
-    source: MjcfSource,
-    recordings: Sequence[Recording],
-    weighed: dict[int, dict[str, float]],
-    contradicted: bool,
-    untold: Collection[int] = (),
-) -> _Concluded:
-    """Corrected model, findings and verdict.
-
-    Args:
-        premises: what the terms were found on.
-        state: the terms.
-        laws: the same without discrepancy.
-        source: the user's model.
-        recordings: those in question.
-        weighed: rivals of terms, by the terms' ids, where they are known; others are added.
-        contradicted: whether the recordings say that the model's numbers are known less well than was supposed.
-        untold: terms that are no findings, and not in the corrected model.
-    """
-    problem, arm = premises.problem, premises.problem.arm
-    # an identification by a poorer motion is no finding
-    wrong = numbers(problem, state, premises.changes) if contradicted else []
-    told = [t for i, t in enumerate(laws.terms) if i not in untold]
-    kept, quiet = transferable(problem, with_terms(problem, told) if untold else laws), problem.noise(()).std
-
-    def correct(by: State) -> Corrected:
-        return _corrected(arm, premises, by, refitted=bool(by.terms or wrong))
-
-    corrected = correct(kept)
-    if worse := misleading(recordings, corrected, quiet, len(kept.terms)):
-        kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
-        corrected = correct(kept)
-    lost = [all(t is not k for k in kept.terms) for t in laws.terms]
-    found = [
-        f for f in findings(problem, state, laws, lost, weighed) if not f.terms or f.terms[0] not in untold
-    ]
-    found, fitted = [*found, *wrong], fit(problem, kept)
-    answer = verdict(found, fitted, partly(problem, state) or not all(_judged(problem)))
-    return _Concluded(
         kept=kept,
-        lost=tuple(gone and i not in untold for i, gone in enumerate(lost)),
-        corrected=_buildable(source, corrected, problem),
-        findings=tuple(calibrated(found, answer, fitted)),
-        fit=fitted,
-        verdict=answer,
-        refitted=bool(wrong),
+        scale=premises.scale,
     )
 
 
@@ -359,7 +303,7 @@ def _too_unsure(findings: Sequence[Finding]) -> str:
     for f in findings:
         where = f"joint{'s' * (len(f.joints) > 1)} {', '.join(str(j + 1) for j in f.joints)}"
         each.append(f"{f.effect.replace('_', ' ')} at {where} ({f.confidence:.2f})")
-    return f"left out, as it is small and hardly likely to be what is missing: {'; '.join(each)}"
+    return f"fits, but is small and hardly likely to be what is missing, and so no finding: {'; '.join(each)}"
 
 
 class _Log(list[str]):
@@ -510,9 +454,9 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
         return "consistent"
     if "unknown" not in names:
         doubtful = any(
-            f.confidence < DOUBTFUL and np.any(f.rms_torque > MISSED * fit.noise_floor) for f in found
+            f.confidence < DOUBTFUL and np.any(f.rms_torque > SMALL * fit.noise_floor) for f in found
         )
-        missed = bool(np.any(fit.held_out_rmse_after > MISSED * fit.noise_floor))
+        missed = bool(np.any(fit.held_out_rmse_after > SMALL * fit.noise_floor))
         unsure = missed and all(f.confidence < UNSURE for f in found)
         held_out = fit.held_out_rmse_before, fit.held_out_rmse_after
         before, after = (np.sum(np.square(error / fit.noise_floor)) for error in held_out)
