@@ -3,8 +3,8 @@
     python docs/picture.py            # writes docs/diagnosis.png
 
 The recording is 20 s of the project's own Panda in MuJoCo's C engine with the sensor noise of the demo, and with
-0.8 N·m of Coulomb friction and 0.6 N·m·s/rad of viscous friction that its file does not hold. What is drawn is
-the figure of the first finding in the report that `jaxpanda diagnose` writes.
+0.8 N·m of Coulomb friction that its file does not hold. What is drawn are the figures of the first finding in the
+report that `jaxpanda diagnose` writes.
 """
 
 import io
@@ -25,7 +25,7 @@ from jaxpanda.simulation import JointFriction, panda_sensors, random_trajectory,
 def main() -> None:
     session.start()
     model, joint = panda_mjcf(), np.eye(7)[3]
-    friction = JointFriction(viscous=0.6 * joint, coulomb=0.8 * joint)
+    friction = JointFriction(viscous=0 * joint, coulomb=0.8 * joint)
     motion = random_trajectory(model, seed=1)
     log = simulate(model, motion, friction=friction, sensors=panda_sensors(), seed=1, name="recording.csv")
     found = diagnosis.diagnose(None, [log])
@@ -34,13 +34,14 @@ def main() -> None:
         values = (f"{p['name']} {p['value']:.3f} ({p['std']:.3f}) {p['unit']}" for p in one.parameters)
         print(f"{one.effect}: {', '.join(values)}")
     first = page.sections(found)[1]
-    (figure,) = first.figures
     with matplotlib.rc_context(
         {"font.size": 8, "lines.linewidth": 0.9, "axes.grid": True, "grid.alpha": 0.3}
     ):
-        canvas = Figure(figsize=figure.size, dpi=100)
+        width, height = np.array([f.size for f in first.figures]).T
+        canvas = Figure(figsize=(width.sum(), height.max()), dpi=100)
         FigureCanvasAgg(canvas)
-        figure.draw(canvas)
+        for part, figure in zip(canvas.subfigures(1, len(first.figures)), first.figures, strict=True):
+            figure.draw(part)
         drawn = io.BytesIO()
         canvas.savefig(drawn)
     small = Image.open(drawn).convert("RGB").quantize(48)
