@@ -17,9 +17,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractEffect, AbstractJointEffect, neighbours, turns
+from ..effects import AbstractEffect, AbstractJointEffect, neighbours
 from ..effects.friction import CoulombFriction
-from .library import columns_of
+from .library import turning
 from .noise import hats
 from .traces import Trace
 
@@ -124,15 +124,6 @@ def _level(torque: Float[np.ndarray, " rows"]) -> float:
     """Of dry friction while its joint moves [N m]."""
     moving = np.abs(torque) > 0.1 * np.abs(torque).max()
     return float(np.sqrt(np.mean(torque[moving] ** 2))) if moving.any() else 0.0
-
-
-def turning(traces: Sequence[Trace], joint: int) -> Float[np.ndarray, "rows n"]:
-    """Signs of a joint's velocity that turn over several speeds and distances, low-passed like the torque."""
-    kinds = sorted({type(e) for e in turns(joint)}, key=lambda kind: kind.__name__)
-    alike = [[e for e in turns(joint) if type(e) is kind] for kind in kinds]
-    return np.concatenate(
-        [np.concatenate([columns_of(same, t)[:, :, 0] for same in alike], 1) for t in traces]
-    )
 
 
 def of_known(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractArmEffect, AbstractEffect, AbstractJointEffect, joint_columns
+from ..effects import AbstractArmEffect, AbstractEffect, AbstractJointEffect, joint_columns, turns
 from .host import parallel
 from .traces import Trace
 
@@ -46,6 +46,15 @@ def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndar
         return np.concatenate(parts, 1)
     arm = [e for e in effects if isinstance(e, AbstractArmEffect)]
     return type(arm[0]).over_many(arm, trace.motion)
+
+
+def turning(traces: Sequence[Trace], joint: int) -> Float[np.ndarray, "rows n"]:
+    """Signs of a joint's velocity that turn over several speeds and distances, low-passed like the torque."""
+    kinds = sorted({type(e) for e in turns(joint)}, key=lambda kind: kind.__name__)
+    alike = [[e for e in turns(joint) if type(e) is kind] for kind in kinds]
+    return np.concatenate(
+        [np.concatenate([columns_of(same, t)[:, :, 0] for same in alike], 1) for t in traces]
+    )
 
 
 def form_of(effect: AbstractEffect) -> tuple[str, str]:

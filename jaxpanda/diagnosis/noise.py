@@ -2,7 +2,8 @@
 
 The noise must not be read off the residual of the nominal model: what is slow in a missing effect would pass for
 correlated noise, and hide it. A saturated fit (rigid body with free parameters, smooth functions of position,
-velocity, load and time) takes any effect away first, as well as it can, at the price of its degrees of freedom.
+velocity, load and time, dry friction that turns over a distance) takes any effect away first, as well as it can,
+at the price of its degrees of freedom.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ import scipy.linalg
 from jaxtyping import Float
 
 from .host import parallel
+from .library import turning
 from .traces import Trace
 
 ORDER = 3
@@ -96,7 +98,8 @@ class Saturation:
         shaken = stacked(lambda t: t.shaken[:, joint])
         smooth = [rigid, shaken, hats(q, knots(10)), speed, hats(load, knots(5)), swings, clock]
         rough = [sign[:, None] * x for x in (speed, hats(q, knots(4)), hats(load, knots(3)), clock[:, ::2])]
-        A = np.concatenate([*smooth, *rough, *([np.concatenate(list(extra))] if len(extra) else [])], 1)
+        turned = turning(traces, joint)
+        A = np.concatenate([*smooth, *rough, turned, *([np.concatenate(list(extra))] if len(extra) else [])], 1)
         return A * self._weight(joint)[:, None]
 
     def left(

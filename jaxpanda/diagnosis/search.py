@@ -50,7 +50,7 @@ _TRIED = 5
 _WINDOW = 0.5
 """Share of the best proposal's log probability from which others are weighed beside it."""
 _PAIRED, _FEW = 2, 8
-"""Rivals of a term that are tried with another beside them; terms of a model up to which they are."""
+"""Rivals of a term that are tried with another beside them; terms that act in its joints up to which they are."""
 _ROUNDS, _MOST = 4, 60
 """Rounds of steps, and terms of a model: nothing that ends by itself comes near."""
 _CROWDED = 4
@@ -260,11 +260,13 @@ def instead(problem: Problem, state: State, i: int, free: bool = True) -> list[C
     }  # fmt: skip
     proposals = _new(others, ranked(problem, rest, state.noise, acts), free)
     found = choices(problem, others, rest, state.noise, proposals)
-    if not term.effect.bound_to_recording and len(state.terms) <= _FEW:
+    crowd = np.flatnonzero(state.shares @ state.shares[i] > _OVERLAP)
+    if not term.effect.bound_to_recording and len(crowd) <= _FEW:
         rivals = [choice for choice in found if choice[1][0].key != term.key][:_PAIRED]
         found += [
             pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts, free))
         ]
+        found += _parts(problem, others, state.noise, term, acts, free)
     own = evidence(problem, state.terms, state.design, state.noise) - beside(problem, state, (i,), rest)
     return sorted([(own, (term,)), *found], key=lambda choice: -choice[0])
 
@@ -283,6 +285,29 @@ def _with_another(
     proposals = [p for p in _new(terms, ranked(problem, design, noise, joints), free) if p.evidence > 0]
     found = choices(problem, terms, design, noise, proposals)
     return (choice[0] + found[0][0], (*choice[1], *found[0][1])) if found and found[0][0] > 0 else None
+
+
+def _parts(
+    problem: Problem,
+    others: Sequence[Term],
+    noise: Noise,
+    whole: Term,
+    joints: Collection[int],
+    free: bool,
+) -> list[Choice]:
+    """What a law is a sum of, each part a term of its own: what is left of the law without what makes it one."""
+    if len(whole.effect.held) < 2:
+        return []
+    gained, parts = 0.0, ()
+    for part in whole.effect.held:
+        terms = (*others, *parts)
+        design = problem.design(terms, noise)
+        of_kind = [p for p in ranked(problem, design, noise, joints) if isinstance(p.effect, part)]
+        found = choices(problem, terms, design, noise, _new(terms, of_kind, free))
+        if not found:
+            return []
+        gained, parts = gained + found[0][0], (*parts, *found[0][1])
+    return [(gained, parts)]
 
 
 def _new(terms: Sequence[Term], proposals: Sequence[Proposal], free: bool) -> list[Proposal]:
