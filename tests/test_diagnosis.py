@@ -27,13 +27,13 @@ from jaxpanda.diagnosis.knowledge import check, inertial_spread
 from jaxpanda.diagnosis.noise import autoregression, moments
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
-from jaxpanda.diagnosis.search import exchange, transferable
+from jaxpanda.diagnosis.search import exchange, instead, transferable
 from jaxpanda.diagnosis.state import with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.drive import Backlash, JointElasticity
-from jaxpanda.effects.friction import FrictionDrift
+from jaxpanda.effects.friction import CoulombFriction, FrictionDrift
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.motion import masses
 from jaxpanda.effects.sensing import TorqueCrosstalk, TorqueOffset
@@ -359,6 +359,26 @@ def test_a_much_likelier_rival_takes_a_term_s_place():
     assert [t.key for t in found.terms] == [("coulomb_friction", (3,))]
     again = exchange(problem, found, lambda _: None)
     assert [t.key for t in again.terms] == [t.key for t in found.terms]
+
+
+@pytest.mark.slow
+def test_the_parts_of_a_law_take_the_place_of_one_that_is_nothing_but_their_sum():
+    """Stribeck's friction of no static excess, put in by hand beside friction of four other joints."""
+    level = np.array([0.5, 0.5, 0.5, 0.8, 0.4, 0.0, 0.0])
+    slope = 2.0 * (np.arange(7) == 3)
+    friction = lambda t, q, qd, qdd: level * np.tanh(qd / 0.01) + slope * qd
+    problem = pose((prepare(record(3, friction), Arm.panda()),), (True,), "exact").problem
+    std = problem.noise(()).std
+    others = [
+        problem.term(CoulombFriction(j, 0.01), np.ones(1), level[[j]], std, -12.0) for j in (0, 1, 2, 4)
+    ]
+    law, c = StribeckFriction(3, 0.3, 0.01, 2.0, "viscous"), np.array([0.8, 0.01, 2.0])
+    sums = problem.term(law, np.ones(3), c, std, -40.0)
+    state = with_terms(problem, [*others, sums])
+    assert [t.key for t in instead(problem, state, 4)[0][1]] == [
+        ("coulomb_friction", (3,)),
+        ("viscous_friction", (3,)),
+    ]
 
 
 @pytest.mark.slow

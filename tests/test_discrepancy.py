@@ -8,7 +8,7 @@ import pytest
 from helpers import NOISE, record
 
 from jaxpanda import Arm
-from jaxpanda.diagnosis.discrepancy import of_known, of_law, unresolved
+from jaxpanda.diagnosis.discrepancy import at_rest, of_known, of_law, unresolved
 from jaxpanda.diagnosis.events import ripple
 from jaxpanda.diagnosis.evidence import Design, Noise
 from jaxpanda.diagnosis.premises import pose
@@ -147,9 +147,9 @@ def test_known_damping_is_a_law_like_known_friction_of_coulombs_kind():
 def test_what_no_column_describes_is_a_share_of_the_torque_and_of_its_rate(quiet):
     trace = quiet.traces[0]
     steady = np.full((trace.motion.samples, 7), 2.0)
-    np.testing.assert_allclose(unresolved([trace], TorqueOffset(3), [steady]), 0.06**2)
+    np.testing.assert_allclose(unresolved([trace], [steady]), 0.06**2)
     ramp = np.outer(trace.motion.time, np.eye(7)[3])
-    off = unresolved([trace], TorqueOffset(3), [ramp])
+    off = unresolved([trace], [ramp])
     np.testing.assert_allclose(off[:, 3], (0.03 * trace.motion.time) ** 2 + 0.005**2, rtol=1e-6)
     assert not off[:, :3].any()
 
@@ -160,9 +160,9 @@ def test_dry_friction_is_not_known_where_its_joint_rests(quiet):
     rests[:20, 3] = 1.0
     trace = dataclasses.replace(trace, unsure=rests)
     torque = [np.sign(trace.motion.qd) * np.eye(7)[3]]
-    dry, viscous = (unresolved([trace], e, torque) for e in (CoulombFriction(3, 0.01), ViscousFriction(3)))
-    np.testing.assert_allclose((dry - viscous)[:20, 3], 1.0, rtol=1e-9)
-    np.testing.assert_array_equal(dry[20:], viscous[20:])
+    dry = at_rest([trace], CoulombFriction(3, 0.01), torque)
+    np.testing.assert_allclose(dry, rests, rtol=1e-9)
+    assert at_rest([trace], ViscousFriction(3), torque) is None
 
 
 def test_two_hundredths_of_a_strong_law_that_vary_with_speed_are_no_second_effect(damped):
@@ -180,10 +180,10 @@ def test_two_hundredths_of_a_strong_law_of_another_shape_are_a_second_effect(rip
 
 
 def test_a_term_s_law_has_no_discrepancy(damped):
-    state, exact = believed(damped, ViscousFriction(3), np.array([DAMPING]))
+    state, exact = believed(damped, CoulombFriction(3, 0.01), np.array([DAMPING]))
     (term,), (law,) = state.terms, exact.terms
     assert term.width > len(term.deviation) == law.width == 1
-    assert (law.discrepancy, law.unresolved) == ((), None)
+    assert (law.discrepancy, law.unresolved, law.at_rest) == ((), None, None)
     assert law.effect is term.effect
     assert law.columns is term.columns
     assert law.prior == term.prior
@@ -220,6 +220,30 @@ def test_samples_of_which_laws_tell_less_are_worth_what_they_are_likely_in_their
         score[name] = State((), noise, design).score
     assert score["right"] > score["all"] + 100
     assert score["all"] > score["wrong"] + 100
+
+
+def test_what_a_rest_holds_is_one_number_however_many_samples_it_lasts():
+    """Against the density of noise about a level that nobody knows; as one of each sample it cost 460 nats."""
+    count, variance = 200, 100.0
+    x = np.random.default_rng(2).normal(size=count)
+    stays = np.full((count, 1), variance)
+    trust = 1 / np.sqrt(1 + stays)
+    noise = Noise(np.zeros((1, 3)), np.ones(1), np.ones(1), trust, stays)
+    score = State((), noise, Design([np.zeros((count, 0))], [x * trust[:, 0]], np.zeros(0))).score
+    wide = np.eye(count) + variance
+    exact = -0.5 * (x @ np.linalg.solve(wide, x) + np.linalg.slogdet(wide)[1])
+    assert score == pytest.approx(exact, abs=10)
+    of_each = dataclasses.replace(noise, at_rest=None)
+    assert of_each.widened(0, np.ones(count, bool)) == pytest.approx(0.5 * count * np.log(1 + variance))
+
+
+def test_each_rest_has_a_number_of_its_own():
+    stays = np.zeros((30, 1))
+    stays[[*range(5), *range(10, 20)]] = 9.0
+    noise = Noise(np.zeros((1, 3)), np.ones(1), np.ones(1), 1 / np.sqrt(1 + stays), stays)
+    counts = np.arange(30) != 15  # a gap in the second rest
+    rests = np.log1p(45) + np.log1p(45) + np.log1p(36)
+    assert noise.widened(0, counts) == pytest.approx(0.5 * (rests + 14 * 0.9))
 
 
 def test_the_noise_of_a_joint_takes_what_nothing_explains_yet(damped, quiet):

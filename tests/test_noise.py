@@ -87,6 +87,30 @@ def with_slow_errors(seed: int, size: float) -> Recording:
     return dataclasses.replace(right, tau=right.tau + size * NOISE * error)
 
 
+def stop_and_go(seed: int, friction: float) -> Recording:
+    """Motion and rests of 1.5 s by turns; the fourth joint's bristles yield by 1 mrad and hold what they held."""
+    rng, t = np.random.default_rng(seed), np.arange(0, 24, 1 / RATE)
+    w = 2 * np.pi / 3
+    going = np.clip(np.sin(w * t), 0, None)
+    speed, change = 2 * going**2, 4 * going * w * np.cos(w * t)
+    q, along, bend = excitation(ARM, np.cumsum(speed) / RATE, seed)
+    qd = along * speed[:, None]
+    qdd = bend * (speed**2)[:, None] + along * change[:, None]
+    z = np.zeros(len(t))
+    for k in range(1, len(t)):
+        moved = (q[k, 3] - q[k - 1, 3]) / 1e-3
+        z[k] = np.sign(moved) + (z[k - 1] - np.sign(moved)) * np.exp(-abs(moved))
+    tau = np.asarray(LOAD(q, qd, qdd)) + NOISE * rng.normal(size=q.shape)
+    tau[:, 3] += friction * z
+    return Recording("r.csv", t, q + 1e-5 * rng.normal(size=q.shape), tau=tau)
+
+
+def test_what_a_joint_holds_that_sticks_is_no_noise():
+    """To a model that knows where a joint is, and not where it came from, what the joint holds is noise."""
+    noise = lambda level: pose((prepare(stop_and_go(3, level), ARM),), (True,), "exact").problem.noise(()).std
+    np.testing.assert_allclose(noise(1.0), noise(0.0), rtol=0.5)
+
+
 @pytest.mark.parametrize("shape", slow_errors(0.02))
 def test_whitening_undoes_what_makes_noise_slow(shape):
     pole, zero = shape

@@ -91,33 +91,35 @@ def of_law(
     return np.split(np.concatenate(columns, 2), ends)
 
 
-def unresolved(
-    traces: Sequence[Trace], effect: AbstractEffect, torque: Torque
-) -> Float[np.ndarray, "rows dof"]:
+def unresolved(traces: Sequence[Trace], torque: Torque) -> Float[np.ndarray, "rows dof"]:
     """Square of what a law may be off from sample to sample [N² m²]: in proportion to its torque, and to how fast
-    that changes; dry friction at rest, by all of it."""
-    off = _in_proportion(traces, torque)
-    if effect.dry and isinstance(effect, AbstractJointEffect):
-        j = effect.joints[0]
-        rests = [np.zeros(t.motion.samples) if t.unsure is None else t.unsure[:, j] for t in traces]
-        off[:, j] += np.square(_level(np.concatenate(torque)[:, j]) * np.concatenate(rests))
+    that changes."""
+    rates = [np.gradient(tau, t.motion.dt, axis=0) for t, tau in zip(traces, torque, strict=True)]
+    return np.square(UNRESOLVED * np.concatenate(torque)) + np.square(TIMING * np.concatenate(rates))
+
+
+def at_rest(
+    traces: Sequence[Trace], effect: AbstractEffect, torque: Torque
+) -> Float[np.ndarray, "rows dof"] | None:
+    """Square of what a law may be off for as long as a joint rests [N² m²]: dry friction, by all of it."""
+    if not (effect.dry and isinstance(effect, AbstractJointEffect)):
+        return None
+    j = effect.joints[0]
+    rests = [np.zeros(t.motion.samples) if t.unsure is None else t.unsure[:, j] for t in traces]
+    off = np.zeros((sum(map(len, rests)), traces[0].motion.dof))
+    off[:, j] = np.square(_level(np.concatenate(torque)[:, j]) * np.concatenate(rests))
     return off
 
 
 def unresolved_known(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
     """The same of the friction that the user's model holds; where it rests `Trace.trust` says."""
-    return _in_proportion(traces, [_known_friction(t) for t in traces])
+    return unresolved(traces, [_known_friction(t) for t in traces])
 
 
 def _known_friction(trace: Trace) -> Float[np.ndarray, "_time dof"]:
     """Of the user's model [N m]."""
     arm = trace.motion.arm
     return np.asarray(arm.frictionloss) * trace.down(trace.sign) + np.asarray(arm.damping) * trace.motion.qd
-
-
-def _in_proportion(traces: Sequence[Trace], torque: Torque) -> Float[np.ndarray, "rows dof"]:
-    rates = [np.gradient(tau, t.motion.dt, axis=0) for t, tau in zip(traces, torque, strict=True)]
-    return np.square(UNRESOLVED * np.concatenate(torque)) + np.square(TIMING * np.concatenate(rates))
 
 
 def _level(torque: Float[np.ndarray, " rows"]) -> float:

@@ -41,6 +41,9 @@ class Noise:
     """Of the noise itself [N m]."""
     trust: Float[np.ndarray, "rows dof"] | None = None
     """What a sample weighs beside what laws may be off there, 0 to 1; None where there are no laws."""
+    at_rest: Float[np.ndarray, "rows dof"] | None = None
+    """Of the variance that `trust` allows for, in that of the noise, what stays the same for as long as a joint
+    rests: friction that may carry any load up to its level."""
     slow: Float[np.ndarray, "dof 2"] | None = None
     """Pole p and zero z of a slow error beside the noise: what is white is $(1 - p L) / (1 - z L)$ of the
     innovations, with L the step back; as good as none where they are equal."""
@@ -70,6 +73,24 @@ class Noise:
         for rows in stretches(counts):
             out[rows], _ = levelled(y[rows], self.slow[joint])  # pyright: ignore
         return out
+
+    def widened(self, joint: int, counts: Bool[np.ndarray, " rows"]) -> float:
+        r"""What it costs that samples may be further off than the noise, `trust`, in the rows that count [nats].
+
+        Of errors from sample to sample of variance $i_t$, in the noise's, it is $\tfrac12 \sum \log(1 + i_t)$. An
+        error of variance $\rho$ that stays for a rest is one number: $\tfrac12 \log(1 + \sum \rho_t / (1 + i_t))$
+        for each, and the samples scatter about it as they would without.
+        """
+        if self.trust is None:
+            return 0.0
+        spread = 1 / np.maximum(self.trust[:, joint], 1e-9) ** 2
+        stays = (
+            np.zeros_like(spread) if self.at_rest is None else np.where(counts, self.at_rest[:, joint], 0.0)
+        )
+        own = spread - stays
+        rests = np.array([np.sum((stays / own)[rows]) for rows in stretches(stays > 0)])
+        each = np.log(own[counts]) + (stays / spread)[counts]
+        return 0.5 * float(np.sum(each) + np.sum(np.log1p(rests)))
 
     def has_slow(self, joint: int) -> bool:
         """Whether there is an error slower than the noise in a joint."""

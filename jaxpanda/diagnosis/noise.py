@@ -99,7 +99,9 @@ class Saturation:
         smooth = [rigid, shaken, hats(q, knots(10)), speed, hats(load, knots(5)), swings, clock]
         rough = [sign[:, None] * x for x in (speed, hats(q, knots(4)), hats(load, knots(3)), clock[:, ::2])]
         turned = turning(traces, joint)
-        A = np.concatenate([*smooth, *rough, turned, *([np.concatenate(list(extra))] if len(extra) else [])], 1)
+        A = np.concatenate(
+            [*smooth, *rough, turned, *([np.concatenate(list(extra))] if len(extra) else [])], 1
+        )
         return A * self._weight(joint)[:, None]
 
     def left(

@@ -18,7 +18,7 @@ from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect, Channels, 
 from ..errors import InputError
 from . import catchall
 from .bodies import Body, body
-from .discrepancy import of_law, unresolved, unresolved_known
+from .discrepancy import at_rest, of_law, unresolved, unresolved_known
 from .evidence import Design, Noise, OnDemand
 from .host import parallel
 from .library import Candidates, build, columns_of
@@ -47,13 +47,15 @@ class Term:
     """What its law may be off, with coefficients of unit variance; none where empty."""
     unresolved: Float[np.ndarray, "rows dof"] | None = None
     """Square of what it may be off from sample to sample, which no column describes [N² m²]."""
+    at_rest: Float[np.ndarray, "rows dof"] | None = None
+    """Square of what it may be off for as long as a joint rests, likewise [N² m²]."""
     prior: float = 0.0
     """Logarithm of its prior odds, less what the search over its shapes has cost [nats]."""
 
     @property
     def law(self) -> "Term":
         """The law alone, believed to the last digit."""
-        return dataclasses.replace(self, discrepancy=(), unresolved=None)
+        return dataclasses.replace(self, discrepancy=(), unresolved=None, at_rest=None)
 
     @property
     def key(self) -> tuple[str, tuple[int, ...]]:
@@ -187,7 +189,9 @@ class Problem:
         torque = [x @ c for x in columns]
         evaluate = lambda other: [x @ c for x in self.full_columns(other)]
         off = tuple(of_law(self.traces, effect, torque, std, evaluate))
-        return Term(effect, columns, deviation, off, unresolved(self.traces, effect, torque), prior)
+        traces = self.traces
+        rests = at_rest(traces, effect, torque)
+        return Term(effect, columns, deviation, off, unresolved(traces, torque), rests, prior)
 
     def full_columns(self, effect: AbstractEffect) -> list[Float[np.ndarray, "_time dof _n"]]:
         """Columns of an effect, at all joints."""
@@ -530,8 +534,10 @@ class Problem:
             )
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         off = self._known_unresolved + sum(t.unresolved for t in terms if t.unresolved is not None)
-        trust = 1 / np.sqrt(1 + off / np.square(std))
-        return Noise(np.stack(a), np.array(sigma), np.array(std), trust)
+        rests = np.zeros_like(off) + sum(t.at_rest for t in terms if t.at_rest is not None)
+        off, rests = off / np.square(std), rests / np.square(std)
+        trust = 1 / np.sqrt(1 + off + rests)
+        return Noise(np.stack(a), np.array(sigma), np.array(std), trust, rests)
 
     @functools.cached_property
     def _known_unresolved(self) -> Float[np.ndarray, "rows dof"]:
