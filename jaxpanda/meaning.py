@@ -40,6 +40,8 @@ _NEEDS, _EACH = 15.0, 7.0
 """Evidence over the plain reading that it takes besides, at least, and for each choice that a reading has [nats].
 Errors are never quite as modelled: physics that no model holds gained other readings up to 6 a choice in
 trials."""
+_CHOICES_OF_MOUNTING = 3
+"""A direction, and whether it is the moon's."""
 _BETTER = 15.0
 """Evidence that a further swap of joints must gain [nats]."""
 _PRIOR = 0.01
@@ -209,6 +211,24 @@ def meaning(recording: Recording, arm: Arm) -> Meaning | None:
     return _told(best, model, min(confidence, 0.995), float(gain))
 
 
+def mounted(found: Meaning, others: Sequence[Recording], arm: Arm) -> bool:
+    """Whether a mounting that one recording tells is that of all together: an arm stands as it stands.
+
+    Args:
+        found: the mounting.
+        others: with torque.
+        arm: as for `meaning`.
+    """
+    assert found.gravity is not None
+    gained, order = found.evidence, np.arange(arm.dof)
+    for recording in others:
+        if (samples := _sampled(recording)) is not None and len(samples.moving):
+            with threadpool_limits(limits=1, user_api="blas"):
+                turned = _Model(arm, samples, order, np.array(found.gravity))
+                gained += turned.evidence() - _Model(arm, samples, order).evidence()
+    return bool(gained > _EACH * _CHOICES_OF_MOUNTING - np.log(1 - SURE))
+
+
 def _needs(reading: "_Reading") -> float:
     """Evidence over the plain reading that one needs, by its choices: which joints, a constant each [nats]."""
     if not reading.kind:
@@ -220,7 +240,7 @@ def _needs(reading: "_Reading") -> float:
         "gravity_removed": 1,
         "sign": 1 if common else altered,
         "unit": 1 if usual else altered if common else 2 * altered,
-        "mounting": 3,
+        "mounting": _CHOICES_OF_MOUNTING,
     }
     return max(_NEEDS, _EACH * choices.get(reading.kind, altered))
 

@@ -16,7 +16,7 @@ from jaxpanda import Recording
 from jaxpanda.__main__ import main
 from jaxpanda.diagnosis.finding import FAMILIES
 from jaxpanda.effects import CATALOGUE
-from jaxpanda.meaning import meaning
+from jaxpanda.meaning import meaning, mounted
 from jaxpanda.mjcf import from_mjcf
 from jaxpanda.recordings import save
 
@@ -97,6 +97,19 @@ def test_another_mounting_is_named(trial):
     found = named(trial, "wall")
     assert "on a wall" in found.says
     assert np.linalg.norm(found.gravity) == pytest.approx(9.81, abs=1.0)
+
+
+def test_a_mounting_is_one_of_all_recordings(trial, tmp_path):
+    """Friction of one recording may look like another gravity; the arm stands as the other recording shows it."""
+    text, turned = trial.made("wall", *CASE)
+    (tmp_path / "arm.xml").write_text(text)
+    arm, _ = from_mjcf(tmp_path / "arm.xml")
+    found = meaning(turned, arm)
+    assert found is not None
+    seeming = dataclasses.replace(found, evidence=40.0)
+    assert mounted(seeming, [], arm)
+    assert mounted(seeming, [turned], arm)
+    assert not mounted(seeming, [trial.made("exact", *CASE)[1]], arm)
 
 
 @pytest.mark.parametrize(

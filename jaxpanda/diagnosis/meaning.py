@@ -11,7 +11,7 @@ import numpy as np
 from .. import markup, summaries
 from ..corrected import Corrected
 from ..export import missing_assets
-from ..meaning import Meaning, meaning
+from ..meaning import Meaning, meaning, mounted
 from ..mjcf import MjcfSource
 from ..recordings import Recording
 from ..report import Section
@@ -100,7 +100,7 @@ def misread(
         knowledge: how well its numbers are known; passed on.
     """
     arm = traces[0].motion.arm
-    read = [(one.name, meaning(one, arm)) for one in recordings]
+    read = [(one.name, _borne_out(meaning(one, arm), one, recordings, arm)) for one in recordings]
     told = [(name, found) for name, found in read if found is not None]
     if not told:
         return None
@@ -124,6 +124,15 @@ def misread(
         notes=tuple(notes),
         knowledge=knowledge,
     )
+
+
+def _borne_out(
+    found: Meaning | None, one: Recording, recordings: Sequence[Recording], arm: Any
+) -> Meaning | None:
+    """What one recording tells, unless it is a mounting that the others contradict."""
+    if found is None or found.kind != "mounting":
+        return found
+    return found if mounted(found, [r for r in recordings if r is not one], arm) else None
 
 
 def _finding(names: Sequence[str], found: Meaning, arm: Any) -> Finding:
