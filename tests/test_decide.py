@@ -68,7 +68,7 @@ def test_friction_that_a_line_was_fitted_to_is_told_as_the_curve_it_is():
     level, slope = np.linalg.lstsq(np.stack([np.ones(50), speeds], 1), curve(speeds))[0]
     at = lambda value: jnp.zeros(7).at[3].set(value)
     arm = dataclasses.replace(Arm.panda(), frictionloss=at(level), damping=at(slope))
-    one = record(30, lambda t, q, qd, qdd: curve(qd) * np.eye(7)[3])
+    one = record(33, lambda t, q, qd, qdd: curve(qd) * np.eye(7)[3])
     problem = pose((prepare(one, arm),), (True,), "exact").problem
     state = search(problem)
     (term,) = (t for t in state.terms if 3 in t.effect.joints)
