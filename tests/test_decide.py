@@ -61,14 +61,21 @@ def test_crosstalk_carries_what_its_source_is_missing_too(tmp_path):
     assert error < 0.06  # the noise is 0.05
 
 
-def test_friction_that_a_line_was_fitted_to_is_told_as_the_curve_it_is():
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(30, marks=pytest.mark.xfail(reason="a free form is as likely there", strict=True)),
+        33,
+    ],
+)
+def test_friction_that_a_line_was_fitted_to_is_told_as_the_curve_it_is(seed):
     """It needs less of the model's Coulomb and viscous friction at once, and was a contact beside one of them."""
     curve = lambda qd: 9.0 * np.sqrt(np.abs(qd)) * np.tanh(qd / 0.005)
     speeds = np.linspace(0.02, 1.0, 50)
     level, slope = np.linalg.lstsq(np.stack([np.ones(50), speeds], 1), curve(speeds))[0]
     at = lambda value: jnp.zeros(7).at[3].set(value)
     arm = dataclasses.replace(Arm.panda(), frictionloss=at(level), damping=at(slope))
-    one = record(33, lambda t, q, qd, qdd: curve(qd) * np.eye(7)[3])
+    one = record(seed, lambda t, q, qd, qdd: curve(qd) * np.eye(7)[3])
     problem = pose((prepare(one, arm),), (True,), "exact").problem
     state = search(problem)
     (term,) = (t for t in state.terms if 3 in t.effect.joints)
