@@ -170,7 +170,12 @@ def _windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposa
             ),
             range(problem.dof),
         )
-        b, G, H, C = (_cumulated(np.sum([p[k] for p in parts], 0)) for k in range(4))
+        b, G, H = (_cumulated(sum(p[k] for p in parts[1:]) + parts[0][k]) for k in range(3))
+        C = np.zeros((len(b), len(design.g), b.shape[1]))
+        for *_, of_joint in parts:
+            for at, products in of_joint:
+                C[1:, at] += products
+        np.cumsum(C, 0, out=C)
         passed = None
         if any(noise.has_slow(j) for j in range(problem.dof)):
             power = np.array([np.trace(p[1].sum((0, 1))) for p in parts]) + 1e-300
@@ -209,9 +214,10 @@ def _binned(
     bins: int,
     joint: int,
     payload: PayloadChange,
-) -> tuple[np.ndarray, ...]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[slice, np.ndarray]]]:
     r"""What a joint adds, bin by bin of a recording, to $\Phi^\top r$, to the Gram matrices of the contacts and
-    of the payload, and to $A^\top \Phi$. What depends on the joint's noise alone is kept."""
+    of the payload, and to $A^\top \Phi$, of this the rows of what acts there. What depends on the joint's noise
+    alone is kept."""
     here, trace = problem.whitened_joint(noise, joint, design.terms), problem.traces[r]
 
     def split(x: np.ndarray) -> np.ndarray:
@@ -229,19 +235,18 @@ def _binned(
         grams = apart.swapaxes(2, 3) @ apart, whole.swapaxes(1, 2) @ whole
         here.blocks["windows", r] = F, {"grams": grams, "nuisance": with_model(here.nuisance, F)}
     F, kept = here.blocks["windows", r]
-    C = np.zeros((len(F), len(design.g), F.shape[2]))
     place = here.nuisance.shape[1]
-    C[:, :place] = kept["nuisance"]
+    products = [(slice(0, place), kept["nuisance"])]
     for term in design.terms:
         width, A = term.width, here.terms[id(term)][1]
         if A is not None:
             if id(term) not in kept:
                 kept[id(term)] = with_model(A, F)
-            C[:, place : place + width] = kept[id(term)]
+            products.append((slice(place, place + width), kept[id(term)]))
         place += width
     left = _turned_back(noise, joint, design.left[joint][rows])
     b = np.einsum("ts,tsk->tk", split(left), F)
-    return b, *kept["grams"], C
+    return b, *kept["grams"], products
 
 
 def _window_sums(sums, pairs, passed):

@@ -80,6 +80,19 @@ class Term:
         """How many coefficients it has in a design."""
         return len(self.precision)
 
+    @functools.cached_property
+    def acts(self) -> Bool[np.ndarray, " dof"]:
+        """In which joints."""
+        return np.any([np.any(c, (0, 2)) for c in self.columns], 0)
+
+    def torque_at(self, joint: int, x: Float[np.ndarray, " width"]) -> list[Float[np.ndarray, " _time"]]:
+        """Torque of a joint in each recording with these coefficients, the discrepancy's included [N m]."""
+        own = len(self.deviation)
+        law = [c[:, joint] @ x[:own] for c in self.columns]
+        if not self.discrepancy:
+            return law
+        return [tau + d[:, joint] @ x[own:] for tau, d in zip(law, self.discrepancy, strict=True)]
+
     def at_joint(self, joint: int) -> list[Float[np.ndarray, "_time width"]]:
         """Columns of a joint in each recording, the discrepancy's last."""
         law = [c[:, joint] for c in self.columns]
@@ -310,8 +323,7 @@ class Problem:
             here = self._joints[key] = Whitened(stamp, residual, nuisance)
         for term in terms:
             if id(term) not in here.terms:
-                acts = any(np.any(c[:, joint]) for c in term.columns)
-                rows = self.whitened(term.at_joint(joint), noise, joint) if acts else None
+                rows = self.whitened(term.at_joint(joint), noise, joint) if term.acts[joint] else None
                 here.terms[id(term)] = term, rows
         return here
 
@@ -511,7 +523,7 @@ class Problem:
                 taus = [t.signals.tau for t in self.traces if t.signals.tau is not None]
                 quiet = float(np.median([signals_.white_noise(tau)[joint] for tau in taus]))
                 return np.zeros(ORDER), _UNHEARD, max(quiet, QUIETEST)
-            here = [t for t in (*self.background, *terms) if any(np.any(c[:, joint]) for c in t.columns)]
+            here = [t for t in (*self.background, *terms) if t.acts[joint]]
             key = joint, *(id(t) for t in here)
             if key not in self._noises:
                 extra = [

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from .evidence import Design, Noise, levelled, stretches
+from .evidence import Design, Noise, stretches
 from .problem import Problem, Term
 
 
@@ -96,8 +96,14 @@ def misfit(
     problem: Problem, terms: Sequence[Term], x: Float[np.ndarray, " n"], joint: int
 ) -> list[Float[np.ndarray, " _time"]]:
     """What a model leaves of a joint's torque in each recording [N m]."""
-    parts = zip(problem.residual, problem.nuisance, *(t.at_joint(joint) for t in terms), strict=True)
-    return [r[:, joint] - np.concatenate([n[:, joint], *columns], 1) @ x for r, n, *columns in parts]
+    count = problem.nuisance[0].shape[2]
+    out = [r[:, joint] - n[:, joint] @ x[:count] for r, n in zip(problem.residual, problem.nuisance, strict=True)]
+    for term in terms:
+        own, count = x[count : count + term.width], count + term.width
+        if term.acts[joint]:
+            for left, torque in zip(out, term.torque_at(joint, own), strict=True):
+                left -= torque
+    return out
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,12 +123,12 @@ def beyond(left: Sequence[Float[np.ndarray, " _time"]], dt: float) -> Beyond:
     numbers must be worth it (Schwarz 1978)."""
     best, shape = float(np.log(max(_mean_square(np.concatenate(left)), 1e-300))), (0.0, 0.0)
     count = max(sum(map(np.count_nonzero, left)), 2)
-    parts = [part[rows] for part in left for rows in stretches(part != 0)]
-    for tried in slow_errors(dt) if best > 0 else ():
-        square = sum(float(np.vdot(y, y)) for y, _ in (levelled(part, tried) for part in parts))
-        found = float(np.log(square / count)) + 2 * np.log(count) / count
-        if found < best:
-            best, shape = found, tried
+    if best > 0:
+        tried = slow_errors(dt)
+        squares = sum(_levelled_squares(part[rows], dt) for part in left for rows in stretches(part != 0))
+        found = np.log(squares / count) + 2 * np.log(count) / count
+        if found.min() < best:
+            best, shape = float(found.min()), tried[int(found.argmin())]
     scale = _STEP ** np.floor(max(best, 0.0) / (2 * np.log(_STEP)))
     return Beyond(scale, shape, 1 + best if best > 0 else float(np.exp(best)))
 
@@ -139,6 +145,31 @@ def slow_errors(dt: float) -> tuple[tuple[float, float], ...]:
             out.append((pole, zero))
             times *= _LARGER
     return tuple(out)
+
+
+def _levelled_squares(y: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " slow_errors"]:
+    r"""Sum of squares of `levelled` for each of `slow_errors`, which differ little from one to the next.
+
+    $\sum_t u_t^2 = \sum_k r_k c_k - e$ with r the autocorrelation of y, c that of the filter's response
+    $1, (z-p), (z-p) z, \ldots$, and e what it answers behind the stretch.
+    """
+    related, behind, powers = _responses(dt, len(y))
+    lagged = np.fft.irfft(np.abs(np.fft.rfft(y, 2 * len(y))) ** 2)[: len(y)]
+    return related @ lagged - behind * (powers @ y[::-1]) ** 2
+
+
+@functools.lru_cache(maxsize=64)
+def _responses(dt: float, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each of `slow_errors` the autocorrelation of its response at so many lags, with those that count twice;
+    $(z-p)^2/(1-z^2)$; and the powers of z."""
+    pole, zero = np.transpose(slow_errors(dt))
+    powers = zero[:, None] ** np.arange(count)
+    behind = (zero - pole) ** 2 / (1 - zero**2)
+    related = behind[:, None] * powers
+    related[:, 0] += 1
+    related[:, 1:] += (zero - pole)[:, None] * powers[:, :-1]
+    related[:, 1:] *= 2
+    return related, behind, powers
 
 
 def in_noise(problem: Problem, terms: Sequence[Term], noise: Noise) -> State:
