@@ -214,7 +214,10 @@ def _is_new(problem: Problem, step: tuple[str, bool], state: State, which: Seque
 
 
 def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
-    """One term in the place of several that act together: of all in a joint, or of a pair."""
+    """One term in the place of several that act together: of all in a joint, or of a pair.
+
+    What joins it afterwards must make the whole likelier: else it may be what was just taken out, without end.
+    """
     while True:
         groups = [
             tuple(i for i, t in enumerate(state.terms) if t.effect.joints == (j,)) for j in range(problem.dof)
@@ -244,7 +247,7 @@ def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
                     continue
                 gone = ", ".join(name(state.terms[i]) for i in group)
                 say(f"{name(found[0][1][0])} for {gone}: {found[0][0]:.1f} for {own:.1f}")
-                state = grow(problem, fewer, say, free)
+                state = _likelier(problem, fewer, grow(problem, fewer, say, free), say)
                 break
         else:
             return state
