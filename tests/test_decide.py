@@ -20,7 +20,7 @@ from jaxpanda.diagnosis.events import windows
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.proposals import grids
-from jaxpanda.diagnosis.search import climb, search
+from jaxpanda.diagnosis.search import climb, merge, posterior, search
 from jaxpanda.diagnosis.shapes import refine
 from jaxpanda.diagnosis.state import likelier, misfit, places, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
@@ -189,6 +189,24 @@ def test_an_offset_beside_friction_is_no_asymmetric_friction():
 
 
 @pytest.mark.slow
+def test_a_joint_that_turned_one_way_only_has_friction_rather_than_an_offset():
+    """It stays where it was when the joint stopped. An offset was told in its place, at 0.9."""
+    t = np.arange(0.0, 12.0, 0.005)
+    eased = lambda x: x**3 * (10 - 15 * x + 6 * x**2)
+    way = eased(np.clip((t + 1) / 5, 0, 1)) + eased(np.clip((t - 7) / 3, 0, 1))
+    q = np.array([0.1, 0.4, -0.2, -1.8, 0.0, 1.6, 0.3]) + way[:, None] * [0.4, -0.2, 0.5, 0.4, 0.3, -0.3, 0.6]
+    qd, qdd = np.gradient(q, t, axis=0), np.gradient(np.gradient(q, t, axis=0), t, axis=0)
+    motion, rng = Motion(Arm.panda(), t, q, qd, qdd, np.zeros_like(q)), np.random.default_rng(0)
+    tau = motion.load + 0.8 * np.eye(7)[2] + 0.05 * rng.standard_normal(q.shape)
+    problem = posed(Recording("one way.csv", t, q, tau=tau))
+    state = search(problem)
+    (term,) = state.terms
+    assert (term.effect.title, term.effect.joints) == ("coulomb_friction", (2,))
+    likely = posterior(problem, state, 0)
+    assert likely["coulomb_friction"] > likely["torque_offset"] > 0.05
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("exponent", [0.5, 2.0])
 def test_friction_with_a_power_of_the_speed_is_found(exponent):
     """It was called a drift of friction, or had no name."""
@@ -265,6 +283,24 @@ def test_of_two_models_the_one_with_the_law_is_likelier_whichever_comes_first():
     assert gained > law.score - nothing.score > 50
     assert likelier((problem, law), (problem, nothing)) == pytest.approx(-gained)
     assert likelier((problem, law), (problem, law)) == 0
+
+
+def test_what_a_merge_took_out_does_not_come_back_without_end(monkeypatch):
+    problem = posed(record(5, lambda t, q, qd, qdd: 0.5 * qd[:, [2]] * np.eye(7)[2]))
+    one = problem.term(ViscousFriction(2), np.array([1.0]))
+    pair = lambda: with_terms(problem, [one, problem.term(CoulombFriction(2, 0.01), np.array([1.0]))])
+    grown = []
+
+    def grow(*_):
+        grown.append(1)
+        assert len(grown) < 5
+        return pair()
+
+    monkeypatch.setattr("jaxpanda.diagnosis.search.grow", grow)
+    monkeypatch.setattr("jaxpanda.diagnosis.search.choices", lambda *_: [(1e9, (one,))])
+    fewer = lambda a, b: float(len(a[1].terms) - len(b[1].terms))
+    monkeypatch.setattr("jaxpanda.diagnosis.search.likelier", fewer)
+    assert merge(problem, pair(), lambda _: None).terms == (one,)
 
 
 def test_what_was_tried_is_forgotten_and_found_again_alike():

@@ -12,9 +12,9 @@ from jaxpanda_kernels import rnea
 from jaxpanda import Arm, InputError, Recording
 from jaxpanda.diagnosis import diagnose
 from jaxpanda.diagnosis.diagnosis import _unheard
-from jaxpanda.diagnosis.evidence import Noise
+from jaxpanda.diagnosis.evidence import Noise, levelled
 from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.state import slow_errors, start
+from jaxpanda.diagnosis.state import _levelled_squares, slow_errors, start
 from jaxpanda.diagnosis.traces import prepare
 
 ARM = Arm.panda()
@@ -123,6 +123,13 @@ def test_whitening_undoes_what_makes_noise_slow(shape):
     assert not found[1300].any()
     np.testing.assert_allclose(found[:1300], white[:1300], atol=1e-9)
     assert noise.level(np.ones(2600), 0, counts)[1299] == pytest.approx((1 - pole) / (1 - zero), rel=0.01)
+
+
+@pytest.mark.parametrize("count", [1, 7, 2600])
+def test_the_likeliest_slow_error_is_that_of_the_least_innovations(count):
+    y = np.cumsum(np.random.default_rng(0).normal(size=count))
+    squares = [np.sum(levelled(y, slow)[0] ** 2) for slow in slow_errors(0.02)]
+    np.testing.assert_allclose(_levelled_squares(y, 0.02), squares, rtol=1e-9)
 
 
 def test_a_slow_error_of_the_model_is_seen_where_there_is_one():

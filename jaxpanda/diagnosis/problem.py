@@ -467,21 +467,22 @@ class Problem:
         """Not whitened: as whoever takes the model to predict torque would see it, slow errors count in full,
         what was put down to the encoders' noise does not help, and of what sensors show there is only what is
         predicted."""
-        residual = np.concatenate(self.residual)
-        parts = zip(self.nuisance, *(t.columns for t in design.terms), strict=True)
-        columns = np.concatenate([np.concatenate(part, 2) for part in parts])
+        residual, nuisance = np.concatenate(self.residual), np.concatenate(self.nuisance)
         out = np.zeros_like(residual)
+        laws = [np.concatenate(term.columns)[:, term.acts] for term in design.terms]
+        ends = nuisance.shape[2] + np.cumsum([0, *(len(term.deviation) for term in design.terms)])
+        at = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
         found = [self.explained(x, design.terms) for x in _left_out(design, folds)]
         for (_, test), x in zip(folds, found, strict=True):
-            out[test] = residual[test] - columns[test] @ x
-        first = self.nuisance[0].shape[2]
-        for term in design.terms:
-            at = slice(first, first + len(term.deviation))
-            first = at.stop
+            left = residual[test] - nuisance[test] @ x[: ends[0]]
+            for term, law, own in zip(design.terms, laws, at, strict=True):
+                left[:, term.acts] -= law[test] @ x[own]
+            out[test] = left
+        for term, own in zip(design.terms, at, strict=True):
             if term.effect.takes_shown:
-                less = columns[:, :, at] - self._of_predicted(term.effect, out)
+                less = np.concatenate(term.columns) - self._of_predicted(term.effect, out)
                 for (_, test), x in zip(folds, found, strict=True):
-                    out[test] += less[test] @ x[at]
+                    out[test] += less[test] @ x[own]
         return out * np.concatenate([t.weights for t in self.traces])
 
     def _of_predicted(

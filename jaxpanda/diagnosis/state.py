@@ -97,7 +97,9 @@ def misfit(
 ) -> list[Float[np.ndarray, " _time"]]:
     """What a model leaves of a joint's torque in each recording [N m]."""
     count = problem.nuisance[0].shape[2]
-    out = [r[:, joint] - n[:, joint] @ x[:count] for r, n in zip(problem.residual, problem.nuisance, strict=True)]
+    out = [
+        r[:, joint] - n[:, joint] @ x[:count] for r, n in zip(problem.residual, problem.nuisance, strict=True)
+    ]
     for term in terms:
         own, count = x[count : count + term.width], count + term.width
         if term.acts[joint]:
