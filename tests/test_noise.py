@@ -125,7 +125,7 @@ def test_whitening_undoes_what_makes_noise_slow(shape):
     assert noise.level(np.ones(2600), 0, counts)[1299] == pytest.approx((1 - pole) / (1 - zero), rel=0.01)
 
 
-@pytest.mark.parametrize("count", [1, 7, 2600])
+@pytest.mark.parametrize("count", [1, 7, 2600, 9000])
 def test_the_likeliest_slow_error_is_that_of_the_least_innovations(count):
     y = np.cumsum(np.random.default_rng(0).normal(size=count))
     squares = [np.sum(levelled(y, slow)[0] ** 2) for slow in slow_errors(0.02)]

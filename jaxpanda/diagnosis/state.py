@@ -155,9 +155,10 @@ def _levelled_squares(y: Float[np.ndarray, " time"], dt: float) -> Float[np.ndar
     $\sum_t u_t^2 = \sum_k r_k c_k - e$ with r the autocorrelation of y, c that of the filter's response
     $1, (z-p), (z-p) z, \ldots$, and e what it answers behind the stretch.
     """
-    related, behind, powers = _responses(dt, len(y))
-    lagged = np.fft.irfft(np.abs(np.fft.rfft(y, 2 * len(y))) ** 2)[: len(y)]
-    return related @ lagged - behind * (powers @ y[::-1]) ** 2
+    lags = min(len(y), round(_FORGOTTEN * max(_LASTING) / dt))
+    related, behind, powers = _responses(dt, lags)
+    lagged = np.fft.irfft(np.abs(np.fft.rfft(y, 2 * len(y))) ** 2)[:lags]
+    return related @ lagged - behind * (powers @ y[::-1][:lags]) ** 2
 
 
 @functools.lru_cache(maxsize=64)
@@ -293,5 +294,7 @@ def overlaps(state: State) -> list[tuple[int, int]]:
 _TOGETHER = 0.02
 _LASTING, _LARGER = (0.5, 2.0), 2.0
 """Of slow errors: how long they last [s], and between their sizes that are told apart."""
+_FORGOTTEN = 40.0
+"""Times that slow errors last after which rounding is all that is left of them."""
 _STEP = 1.1
 """Between the deviations of a joint's noise that are told apart: others' columns are whitened again for each."""
