@@ -70,7 +70,7 @@ class Resistance(eqx.Module):
 
 
 COMMON = -9.0
-"""Prior of what nearly every arm has: friction of its gears."""
+"""Prior of what nearly every arm has: friction of its gears, offsets of its torque sensors."""
 
 
 class AbstractEffect(eqx.Module):

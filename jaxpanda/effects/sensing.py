@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm import Arm
-from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape, settling
+from .effect import COMMON, AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape, settling
 from .motion import Channels, Joint, Motion
 from .twist import low_passed
 
@@ -22,6 +22,7 @@ class TorqueOffset(AbstractInstantEffect):
     name: ClassVar[str] = "torque_offset"
     family: ClassVar[str] = "sensor"
     reveals: ClassVar[str] = "rests, and poses on both sides of the joint's zero of gravity"
+    prior: ClassVar[float] = COMMON
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
