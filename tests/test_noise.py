@@ -14,7 +14,7 @@ from jaxpanda.diagnosis import diagnose
 from jaxpanda.diagnosis.diagnosis import _unheard
 from jaxpanda.diagnosis.evidence import Noise, levelled
 from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.state import _levelled_squares, slow_errors, start
+from jaxpanda.diagnosis.state import _levelled_squares, beyond, slow_errors, start
 from jaxpanda.diagnosis.traces import prepare
 
 ARM = Arm.panda()
@@ -130,6 +130,8 @@ def test_the_likeliest_slow_error_is_that_of_the_least_innovations(count):
     y = np.cumsum(np.random.default_rng(0).normal(size=count))
     squares = [np.sum(levelled(y, slow)[0] ** 2) for slow in slow_errors(0.02)]
     np.testing.assert_allclose(_levelled_squares(y, 0.02), squares, rtol=1e-9)
+    assert not slow_errors(1.5)  # at samples so far apart none is told
+    assert beyond([2.0 * y], 1.5).slow == (0.0, 0.0)
 
 
 def test_a_slow_error_of_the_model_is_seen_where_there_is_one():

@@ -125,8 +125,7 @@ def beyond(left: Sequence[Float[np.ndarray, " _time"]], dt: float) -> Beyond:
     numbers must be worth it (Schwarz 1978)."""
     best, shape = float(np.log(max(_mean_square(np.concatenate(left)), 1e-300))), (0.0, 0.0)
     count = max(sum(map(np.count_nonzero, left)), 2)
-    if best > 0:
-        tried = slow_errors(dt)
+    if best > 0 and (tried := slow_errors(dt)):
         squares = sum(_levelled_squares(part[rows], dt) for part in left for rows in stretches(part != 0))
         found = np.log(squares / count) + 2 * np.log(count) / count
         if found.min() < best:
@@ -155,7 +154,8 @@ def _levelled_squares(y: Float[np.ndarray, " time"], dt: float) -> Float[np.ndar
     $\sum_t u_t^2 = \sum_k r_k c_k - e$ with r the autocorrelation of y, c that of the filter's response
     $1, (z-p), (z-p) z, \ldots$, and e what it answers behind the stretch.
     """
-    lags = min(len(y), round(_FORGOTTEN * max(_LASTING) / dt))
+    longest = max(1e-9, *(zero for _, zero in slow_errors(dt)))
+    lags = min(len(y), 2 + int(np.log(np.finfo(float).eps) / np.log(longest)))  # beyond, rounding is left
     related, behind, powers = _responses(dt, lags)
     lagged = np.fft.irfft(np.abs(np.fft.rfft(y, 2 * len(y))) ** 2)[:lags]
     return related @ lagged - behind * (powers @ y[::-1][:lags]) ** 2
@@ -294,7 +294,5 @@ def overlaps(state: State) -> list[tuple[int, int]]:
 _TOGETHER = 0.02
 _LASTING, _LARGER = (0.5, 2.0), 2.0
 """Of slow errors: how long they last [s], and between their sizes that are told apart."""
-_FORGOTTEN = 40.0
-"""Times that slow errors last after which rounding is all that is left of them."""
 _STEP = 1.1
 """Between the deviations of a joint's noise that are told apart: others' columns are whitened again for each."""
