@@ -251,6 +251,7 @@ def test_a_prediction_says_how_far_it_is_from_torque_that_was_recorded(capsys, t
     assert not re.search(r"\d\.\d{7}", out)
 
 
+@pytest.mark.slow
 def test_the_corrected_file_loads_though_the_user_s_includes_others(capsys, monkeypatch, tmp_path):
     """A finding in such a model ended in "panda.xml: includes 'parts/defaults.xml', which cannot be read"."""
     shutil.copytree(MODELS, tmp_path / "in")

@@ -61,6 +61,7 @@ def test_crosstalk_carries_what_its_source_is_missing_too(tmp_path):
     assert error < 0.06  # the noise is 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed",
     [
@@ -299,6 +300,7 @@ def test_what_was_tried_is_forgotten_and_found_again_alike():
     assert problem.design([law], noise).log_evidence == before
 
 
+@pytest.mark.slow
 def test_friction_that_changes_from_one_repeat_to_the_next_is_a_drift_whatever_stays():
     warms = lambda t, q, qd, qdd: (
         ((0.8 - 0.01 * t)[:, None] * np.tanh(qd[:, [0]] / 0.01) + 0.3 * qd[:, [0]]) * np.eye(7)[0]
@@ -351,6 +353,7 @@ def test_two_joints_with_something_of_their_own_are_no_wrong_link_beyond_them():
         assert {t.key for t in found.terms} == expected
 
 
+@pytest.mark.slow
 def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_hardly_believed():
     problem = posed(record(7, lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) == 1)))
     state = with_terms(problem, [problem.term(CoulombFriction(1, 0.01), np.array([0.5]))])
@@ -383,6 +386,7 @@ def test_what_each_recording_shows_otherwise_is_not_explained():
     assert all(f.confidence < 0.4 for f in named)  # such claims turned out right in 6 trials of 16
 
 
+@pytest.mark.slow
 def test_what_acts_along_a_joint_that_slides_is_told_in_newtons_and_metres():
     """A scale of N m/rad and rms torque in N m were told of a SCARA's lift."""
     panda = Arm.panda()

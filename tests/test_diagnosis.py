@@ -138,6 +138,7 @@ def test_two_effects_are_both_found_and_nothing_else():
     }
 
 
+@pytest.mark.slow
 def test_a_contact_is_found_in_its_interval_and_kept_out_of_predictions(tmp_path):
     contact = ExternalContact(6, 3.0, 4.5, "motion_0.csv", "point base", (0.0, 0.0, 0.1))
 
@@ -179,7 +180,8 @@ def notched(t, q, qd, qdd):
     return 0.4 * x * np.exp(-0.5 * x**2)
 
 
-@pytest.mark.parametrize("law", [pytest.param(coupled, marks=pytest.mark.slow), notched])
+@pytest.mark.slow
+@pytest.mark.parametrize("law", [coupled, notched])
 def test_a_torque_without_a_name_is_predicted_in_a_motion_never_seen(law, tmp_path):
     result = diagnose(None, [record(0, at_joint(3, law)), record(1, at_joint(3, law))])
     assert {(f.effect, f.joints) for f in result.findings} == {("unknown", (2,))}
@@ -208,9 +210,9 @@ PLANAR = """<mujoco><compiler angle="radian"/><worldbody><body>
   </body></body></body></worldbody></mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("gain", "rub", "named"),
-    [pytest.param(1.5, 0.3, "inertial_parameters", marks=pytest.mark.slow), (1.0, 0.0, "coulomb_friction")],
+    ("gain", "rub", "named"), [(1.5, 0.3, "inertial_parameters"), (1.0, 0.0, "coulomb_friction")]
 )
 def test_a_model_whose_own_numbers_are_wrong_is_not_consistent(gain, rub, named, tmp_path):
     """Refitting them explains all, and so nothing was found."""
@@ -231,6 +233,7 @@ def test_a_model_whose_own_numbers_are_wrong_is_not_consistent(gain, rub, named,
     assert np.all(np.sqrt(np.mean(error[80:-80] ** 2, 0)) < np.maximum(0.3 * before, 0.003))
 
 
+@pytest.mark.slow
 def test_what_the_healthy_arm_shows_already_is_not_reported():
     def worn(t, q, qd, qdd):
         return np.eye(7)[3] * 0.3
@@ -406,6 +409,7 @@ def test_a_joint_that_never_moved_is_not_judged_and_that_is_said():
     assert any("joint 4 never moved" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_what_fits_one_recording_only_is_left_out_of_the_corrected_model():
     """An offset that changes sign between the recordings, and friction that does not."""
     offset = lambda sign: lambda t, q, qd, qdd: np.eye(7)[1] * sign * np.ones((len(t), 1))
@@ -638,6 +642,7 @@ def test_a_model_identified_by_a_poor_motion_raises_no_alarm():
     assert found.findings == ()
 
 
+@pytest.mark.slow
 def test_a_body_held_for_a_while_is_a_payload_change():
     arm = Arm.panda()
     body = np.zeros((7, 10))

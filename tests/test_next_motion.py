@@ -143,6 +143,7 @@ def test_a_rival_that_no_motion_rules_out_is_not_decided(known):
     assert [told.rival for told in motion.pairs] == ["asymmetric_friction"]
 
 
+@pytest.mark.slow
 def test_an_effect_of_the_size_that_would_have_shown_has_the_evidence_it_needs(known):
     problem = known[0]
     state = with_terms(problem, ())
