@@ -254,6 +254,9 @@ def test_recordings_of_any_rate_come_on_two_grids_that_belong_together(rate):
 def test_friction_over_a_hair_s_breadth_is_coulomb_s():
     assert PreslidingHysteresis(2, 0.0008, "dahl whole").title == "coulomb_friction"
     assert PreslidingHysteresis(2, 0.003, "dahl whole").title == "presliding_hysteresis"
+    prior = lambda effect: effect.prior + effect.form_prior
+    assert prior(PreslidingHysteresis(2, 0.0008, "jenkins only")) == prior(CoulombFriction(2, 0.01))
+    assert prior(PreslidingHysteresis(2, 0.003, "jenkins only")) < prior(CoulombFriction(2, 0.01))
 
 
 @pytest.fixture(scope="module")

@@ -73,7 +73,7 @@ def _score(problem: Problem, design: Design, noise: Noise, effects, columns):
     else:
         deviation = _deviation(coefficients, np.concatenate(columns) / noise.std[:, None, None], 1.0)
     value, scale = log_bayes(b, G, deviation, scales_of(effects[0]), signs)
-    return value + effects[0].form_prior, scale, deviation
+    return value + [e.form_prior for e in effects], scale, deviation
 
 
 def projection(problem: Problem, design: Design, noise: Noise, effects, columns):

@@ -93,6 +93,13 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         return CoulombFriction.name if self.sticks and self._extent != "extra" else self.name
 
     @property
+    def form_prior(self) -> float:
+        """Dry friction that sticks is Coulomb's, and as likely beforehand."""
+        if self.sticks and self._extent == "only":
+            return CoulombFriction.prior - self.prior
+        return super().form_prior
+
+    @property
     def sticks(self) -> bool:
         """Whether it is Coulomb's friction, which holds a joint at rest."""
         return float(self.breakaway_distance) < STICKS
