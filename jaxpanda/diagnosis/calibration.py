@@ -28,8 +28,9 @@ WEIGHTS = (-1.12, 0.05, 0.56, 2.55, 0.89, -1.32)
 """$w_0 \\ldots w_5$."""
 SUREST = 0.995
 """No finding is surer."""
-TOLD, SMALL = 0.1, 2.0
-"""Confidence from which something small is told, and torque over the noise up to which it is small."""
+TOLD, SMALL = 0.25, 2.0
+"""Confidence from which a finding is told, as one that is missed costs three times what a false one does; and
+torque over the noise up to which it is small."""
 _LEAST_SHARE, _LEAST_SIZE = 1e-4, 1e-2
 
 
@@ -50,9 +51,16 @@ def calibrated(findings: Sequence[Finding], verdict: str, fit: Fit) -> list[Find
     return [_calibrated(f, of_one) for f, of_one in zip(findings, x, strict=True)]
 
 
-def is_told(finding: Finding, fit: Fit) -> bool:
-    """Whether a finding is likely enough to be right, or large."""
-    return finding.confidence >= TOLD or bool(np.any(finding.rms_torque > SMALL * fit.noise_floor))
+def are_told(findings: Sequence[Finding], fit: Fit) -> list[bool]:
+    """Which findings are likely enough to be right; where no effect is, those that are large, as something is
+    missing. What is no term of a model is told always."""
+    any_likely = any(f.confidence >= TOLD for f in findings if f.terms)
+    return [not f.terms or (f.confidence >= TOLD if any_likely else is_large(f, fit)) for f in findings]
+
+
+def is_large(finding: Finding, fit: Fit) -> bool:
+    """Whether its torque stands out of a joint's noise."""
+    return bool(np.any(finding.rms_torque > SMALL * fit.noise_floor))
 
 
 def _error(fit: Fit) -> Float[np.ndarray, " dof"]:

@@ -34,7 +34,7 @@ from ..session import Say, silent
 from . import knowledge as knowledge_
 from . import saved
 from .as_recorded import as_recorded, misleading, predicted
-from .calibration import SMALL, calibrated, is_told
+from .calibration import SMALL, are_told, calibrated, is_large
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import Finding, Fit
@@ -251,15 +251,16 @@ def diagnose(
     more = partly(problem, state) or not all(_judged(problem))
     answer = verdict(found, fitted, more)
     told, notes = calibrated(found, answer, fitted), list(premises.notes)
-    small = [bool(f.terms) and not is_told(f, fitted) for f in told]
-    if any(small):
-        notes.append(_too_unsure([f for f, untold in zip(told, small, strict=True) if untold]))
-        found = [f for f, untold in zip(found, small, strict=True) if not untold]
-        if not found:  # the user's model is as good as any
+    likely = are_told(told, fitted)
+    if not all(likely):
+        unsure = [f for f, on in zip(told, likely, strict=True) if not on]
+        told = [f for f, on in zip(told, likely, strict=True) if on]
+        notes.append(_too_unsure(unsure))
+        more = more or any(is_large(f, fitted) for f in unsure)
+        if not told:  # the user's model is as good as any
             kept = with_terms(problem, ())
             corrected, fitted = correct(kept), fit(problem, kept)
-        answer = verdict(found, fitted, more)
-        told = calibrated(found, answer, fitted)
+        answer = verdict([f for f, on in zip(found, likely, strict=True) if on], fitted, more)
     if any(lost):
         dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
         notes.append(
@@ -303,7 +304,7 @@ def _too_unsure(findings: Sequence[Finding]) -> str:
     for f in findings:
         where = f"joint{'s' * (len(f.joints) > 1)} {', '.join(str(j + 1) for j in f.joints)}"
         each.append(f"{f.effect.replace('_', ' ')} at {where} ({f.confidence:.2f})")
-    return f"fits, but is small and hardly likely to be what is missing, and so no finding: {'; '.join(each)}"
+    return f"fits, but is hardly likely to be what is missing, and so no finding: {'; '.join(each)}"
 
 
 class _Log(list[str]):
@@ -453,9 +454,7 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
     if not names:
         return "consistent"
     if "unknown" not in names:
-        doubtful = any(
-            f.confidence < DOUBTFUL and np.any(f.rms_torque > SMALL * fit.noise_floor) for f in found
-        )
+        doubtful = any(f.confidence < DOUBTFUL and is_large(f, fit) for f in found)
         missed = bool(np.any(fit.held_out_rmse_after > SMALL * fit.noise_floor))
         unsure = missed and all(f.confidence < UNSURE for f in found)
         held_out = fit.held_out_rmse_before, fit.held_out_rmse_after
