@@ -86,14 +86,14 @@ def _likelier(problem: Problem, state: State, other: State, say: Any) -> State:
 
 
 def climb(problem: Problem, state: State, say: Any, *, free: bool = True) -> State:
-    """Steps to a likelier model, as long as there are any; with free forms, or laws only."""
+    """Steps to a likelier model, as long as they lead to another; with free forms, or laws only."""
     for _ in range(_ROUNDS):
         before = state
         state = prune(problem, grow(problem, state, say, free), say)
         state = exchange(problem, state, say, free)
         state = merge(problem, state, say, free)
         state = prune(problem, state, say)
-        if {id(t) for t in state.terms} == {id(t) for t in before.terms}:
+        if sorted(map(name, state.terms)) == sorted(map(name, before.terms)):
             break
     return state
 
