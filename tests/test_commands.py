@@ -145,10 +145,11 @@ def test_the_chain_of_commands_leaves_what_the_interface_promises(capsys, record
     assert max(checked["rollout"]["mujoco"]["rmse_rad"]) < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "own",
     [
-        pytest.param(True, marks=pytest.mark.slow, id="the project's Panda"),
+        pytest.param(True, id="the project's Panda"),
         pytest.param(False, id="an arm of the user's"),
     ],
 )

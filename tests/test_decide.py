@@ -87,6 +87,7 @@ def test_friction_that_a_line_was_fitted_to_is_told_as_the_curve_it_is(seed):
     assert left < 0.2 * users
 
 
+@pytest.mark.slow
 def test_a_law_does_not_do_what_it_likes_at_joints_that_rest():
     """A link that one moving joint showed to be wrong put 35 N m into the others, which friction held."""
     t = np.arange(0, 8, 0.01)
@@ -105,6 +106,7 @@ def test_a_law_does_not_do_what_it_likes_at_joints_that_rest():
     assert max(left) < 0.6  # twice what they are off anyway
 
 
+@pytest.mark.slow
 def test_a_spring_that_stiffens_is_a_spring_wherever_the_joint_moves():
     stiffens = lambda t, q, qd, qdd: (
         np.eye(7)[3] * (3.0 * (q[:, 3] + 1.6) + 40.0 * (q[:, 3] + 1.6) ** 3)[:, None]
@@ -218,6 +220,7 @@ def test_damping_that_differs_between_the_directions_is_found_with_what_is_commo
     assert {n: number[n] for n in expected} == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bias", "drifts"),
     [
@@ -364,6 +367,7 @@ def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_hardly_believe
     assert lost.confidence <= 0.1
 
 
+@pytest.mark.slow
 def test_a_law_foretells_torque_where_it_is_there_and_none_where_it_is_not():
     problem = posed(record(7, lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) == 1)))
     both = [problem.term(CoulombFriction(j, 0.01), np.array([0.5])) for j in (1, 4)]

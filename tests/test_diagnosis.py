@@ -192,7 +192,8 @@ def test_a_torque_without_a_name_is_predicted_in_a_motion_never_seen(law, tmp_pa
     np.testing.assert_allclose(np.sqrt(np.mean(error**2, 0)), NOISE, rtol=0.15)
 
 
-@pytest.mark.parametrize("v", [pytest.param(0.005, marks=pytest.mark.slow), 0.02])
+@pytest.mark.slow
+@pytest.mark.parametrize("v", [0.005, 0.02])
 def test_how_known_friction_turns_is_no_finding(v, tmp_path):
     """Not as MuJoCo's constraint: that was called Stribeck's friction, or a drift of it."""
     model = tmp_path / "rubs.xml"
@@ -405,6 +406,7 @@ def test_a_body_that_is_put_down_is_one_finding():
     assert found[0].confidence > 0.5
 
 
+@pytest.mark.slow
 def test_a_joint_that_never_moved_is_not_judged_and_that_is_said():
     one = record(30, lambda t, q, qd, qdd: np.eye(7)[3] * 5.0 * np.ones((len(t), 1)), still=(3,))
     found = diagnose(None, [one])

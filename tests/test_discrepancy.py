@@ -390,6 +390,7 @@ def test_there_may_be_less_of_a_number_that_the_model_has_and_no_less_than_none(
     assert forms[3].form_prior == 0.0
 
 
+@pytest.mark.slow
 def test_damping_that_the_model_has_too_much_of_is_a_negative_correction():
     arm = dataclasses.replace(Arm.panda(), damping=jnp.zeros(7).at[3].set(2.0))
     less = lambda t, q, qd, qdd: 0.5 * qd[:, [3]] * np.eye(7)[3]  # `record` makes none of the arm's own

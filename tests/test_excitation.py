@@ -199,6 +199,7 @@ def test_it_tells_more_than_random_motions_and_as_much_as_it_says(designed, file
     assert own.conditions["with_friction"] == pytest.approx(np.linalg.cond(unweighted), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_next_motion_builds_on_what_an_identification_knows(designed, file, tmp_path, capsys):
     friction = JointFriction(viscous=0.3, coulomb=0.2)
     log = simulate(

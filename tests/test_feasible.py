@@ -125,6 +125,7 @@ def test_extra_unknowns_stay_in_their_bounds(reachable):
     assert np.all((found.extra >= 0.3) & (found.extra <= 0.7))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_starts_whatever_the_chunk():
     A, b = np.eye(10)[:1], np.array([5.0])
     found = [solve(A, b, boxes(1), starts=6, chunk=chunk, rounds=1, iterations=1) for chunk in (6, 4)]

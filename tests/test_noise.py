@@ -44,6 +44,7 @@ def test_noise_of_a_short_recording_is_that_of_a_long_one():
     np.testing.assert_allclose(np.mean([slow(n) for n in short], 0), slow(long), rtol=0.35)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "seed"), [(1.7, 5), (1.79, 46), (2.0, 0), (2.5, 1), (3.0, 2)])
 def test_a_short_recording_raises_no_false_alarm(seconds, seed):
     """At 1.7 s and 1.79 s, chance makes one joint's noise look a third quieter than it is."""
