@@ -356,6 +356,21 @@ def test_two_joints_with_something_of_their_own_are_no_wrong_link_beyond_them():
         assert {t.key for t in found.terms} == expected
 
 
+def test_a_round_that_leads_back_to_the_same_terms_is_the_last(monkeypatch):
+    """What a round took out by the whole model's score the next added again by its evidence, four times."""
+    problem, rounds = posed(record(7)), []
+
+    def grown(problem, state, say, free):
+        rounds.append(state)
+        return with_terms(problem, [problem.term(CoulombFriction(1, 0.01), np.array([0.5]))])
+
+    monkeypatch.setattr("jaxpanda.diagnosis.search.grow", grown)
+    for step in ("exchange", "merge", "prune"):
+        monkeypatch.setattr(f"jaxpanda.diagnosis.search.{step}", lambda problem, state, *_: state)
+    climb(problem, start(problem), lambda _: None)
+    assert len(rounds) == 2
+
+
 @pytest.mark.slow
 def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_hardly_believed():
     problem = posed(record(7, lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) == 1)))
