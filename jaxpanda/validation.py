@@ -483,6 +483,12 @@ def _mjx_torque(mjx: Any) -> Callable[..., Any]:
     return jit_mjx(jax.vmap(torque, in_axes=(None, None, 0, 0, 0)))
 
 
+def torque_rmse(arm: Arm, recordings: Sequence[Recording], cutoff: float = 5.0) -> Float[np.ndarray, " dof"]:
+    """Error of an arm's torque over some recordings, both sides low-passed alike, as `validate` has it [N m]."""
+    errors = [_torque_error(arm, None, _prepared(r, arm, cutoff)) for r in recordings]
+    return _rms(np.concatenate([e.measured - e.modelled for e in errors]))
+
+
 def _torque_error(arm: Arm, friction: Friction | None, signals: Signals) -> TorqueError:
     assert signals.tau is not None
     qd = jnp.asarray(signals.qd)

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from helpers import record
 from mjcf_cases import chain_of
 
 from jaxpanda import Arm, Recording
-from jaxpanda.diagnosis.traces import held_sign, prepare
+from jaxpanda.diagnosis.traces import WORK_RATE, held_sign, prepare, work_rate
 from jaxpanda.effects.friction import FrictionDrift, LoadDependentFriction
 from jaxpanda.effects.motion import Channels
 from jaxpanda.effects.sensing import TorqueDrift
@@ -72,6 +73,15 @@ def test_shaken_columns_are_the_inertial_torque_of_fast_accelerations():
     inner = slice(30, -30)
     difference = (trace.shaken.sum(2) - expected)[inner]
     assert np.sqrt(np.mean(difference**2)) < 0.15 * np.sqrt(np.mean(expected[inner] ** 2))
+
+
+def test_long_recordings_are_taken_at_a_lower_rate_together():
+    """Six minutes of an arm took 16 GB: as many samples are enough, and motion beyond them is left out."""
+    recording = record(0, seconds=80.0, rate=100.0)
+    rows = [len(prepare(recording, Arm.panda(), coarse=work_rate([recording] * n)).tau) for n in (1, 2, 9)]
+    assert rows == pytest.approx([4000, 2000, 1600], rel=0.05)
+    short = [record(0, seconds=20.0)] * 2
+    assert work_rate(short) == WORK_RATE
 
 
 def test_a_prediction_keeps_motion_that_is_fast_but_above_the_noise_of_q():

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -18,14 +17,7 @@ from ..corrected import KIND, Corrected, read
 from ..effects import AbstractEffect, catalogue_with
 from ..effects.drive import Armature
 from ..errors import InputError, require_x64
-from ..export import (
-    ExportResult,
-    edit_mjcf,
-    missing_assets,
-    panda_mjcf,
-    write_parameters,
-)
-from ..feasible.nearest import are_buildable, nearest_buildable
+from ..export import missing_assets, panda_mjcf
 from ..mjcf import MjcfSource, from_document, from_mjcf, with_gravity
 from ..model_file import Model
 from ..posterior import FILE as POSTERIOR_FILE
@@ -48,13 +40,12 @@ from .problem import FOLDS, Problem
 from .resting import AtRest, judge, rests
 from .search import transferable
 from .state import State, with_terms
-from .traces import Trace, prepare
+from .traces import Trace, prepare, work_rate
 from .uncertainty import polished
 from .unnamed import BEYOND
+from .written import buildable, corrected_document, worsened
 
 NEXT_MOTION = "next_motion.csv"
-UNSEEN = 0.5
-"""Torque over the noise by which links may differ from those found, so that they can be built."""
 UNSURE = 0.6
 """Confidence that no finding reaches where not all is taken for explained."""
 
@@ -216,10 +207,11 @@ def diagnose(
         raise InputError("no recording: a diagnosis needs at least one")
     loaded = [one if isinstance(one, Recording) else load(one) for one in (*recordings, *reference)]
     traces, active = [], [i < len(recordings) for i in range(len(loaded))]
+    coarse = work_rate(loaded)
     for recording in distinct(loaded):
         recording.require_dof(arm.dof)
         recording.require_tau()
-        traces.append(prepare(recording, arm))
+        traces.append(prepare(recording, arm, coarse=coarse))
         progress(_read(traces[-1]))
     suspect = [trace for trace, on in zip(traces, active, strict=True) if on]
     if all(rests(trace) for trace in suspect):
@@ -267,16 +259,18 @@ def diagnose(
             "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
             f" or with all of the motion: {', '.join(sorted(dropped))}"
         )
-    corrected = as_recorded(in_question, _buildable(source, corrected, problem), quiet)
+    corrected = as_recorded(in_question, buildable(source, corrected, problem), quiet)
     # numbers that only moved within what they were uncertain by stay as the user wrote them
-    written, warnings = _written(source, corrected if wrong else corrected.as_written, problem)
+    document, warnings = corrected_document(source, corrected if wrong else corrected.as_written, problem)
+    if document is not source.document:
+        warnings = (*warnings, *worsened(arm, from_document(document, source.dropped)[0], in_question, quiet))
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     return Diagnosis(
         verdict=answer,
         findings=tuple(told),
         fit=fitted,
         corrected=corrected,
-        written=written,
+        written=document,
         notes=(
             *notes,
             *repairs,
@@ -485,84 +479,6 @@ def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) ->
     return Corrected(
         arm, jnp.asarray(change), jnp.asarray(damping), jnp.asarray(level), tuple(effects), tuple(values)
     )
-
-
-def _buildable(source: MjcfSource, corrected: Corrected, problem: Problem) -> Corrected:
-    """The same torque from links that can be built, so that the arm can be simulated; where there are such."""
-    standard = np.asarray(corrected.native.standard)
-    carried = np.stack([link.lumped_standard for link in source.links])
-    if not np.any(np.asarray(corrected.change)) or are_buildable(standard - carried):
-        return corrected
-    nearest, off = _nearest(source, standard, problem)
-    if np.any(off > UNSEEN * problem.noise(()).std):
-        return corrected
-    return eqx.tree_at(lambda c: c.change, corrected, corrected.change + (nearest - standard))
-
-
-def _written(
-    source: MjcfSource, corrected: Corrected, problem: Problem
-) -> tuple[markup.Document, tuple[str, ...]]:
-    """The user's file with what MuJoCo holds natively put in, and what could not be."""
-    moved = bool(np.any(np.asarray(corrected.change)))
-    if not (corrected.effects or moved):
-        return source.document, ()
-    native = corrected.native
-    moved = moved or any(hasattr(e, "standard_change") for e in corrected.effects)
-    warnings: list[str] = []
-    names = ("armature", "damping", "frictionloss", "stiffness", "springref")
-    values = tuple(
-        getattr(native, n) if n == "springref" else jnp.maximum(getattr(native, n), 0.0) for n in names
-    )
-    arm = eqx.tree_at(lambda a: tuple(getattr(a, n) for n in names), corrected.arm, values)
-    result, told = _with_links(source, arm, np.asarray(native.standard) if moved else None, problem)
-    warnings += told
-    document = result.document
-    if not np.allclose(np.asarray(native.chain.gravity), np.asarray(corrected.arm.chain.gravity)):
-        value = " ".join(repr(float(v)) for v in np.asarray(native.chain.gravity))
-        try:
-            document = edit_mjcf(document, {("option", ""): {"gravity": value}})
-        except InputError as error:
-            warnings.append(f"corrected.xml: gravity should be {value}: {error}")
-    beyond = [f"corrected.xml cannot hold {e.name}: {e.equation}" for e, _ in corrected.beyond]
-    warnings += dict.fromkeys(beyond)  # once, however many joints it is at
-    return document, (*warnings, *result.warnings)
-
-
-def _with_links(
-    source: MjcfSource, arm: Arm, standard: Float[np.ndarray, "dof 10"] | None, problem: Problem
-) -> tuple[ExportResult, list[str]]:
-    """The user's file with these links, or the nearest that can be built, or its own; and which it is."""
-    try:
-        return write_parameters(source, arm, standard), []
-    except InputError as error:
-        if standard is None:
-            raise
-        refusal = error
-    nearest, off = _nearest(source, standard, problem)
-    try:
-        result = write_parameters(source, arm, nearest)
-    except InputError:
-        return write_parameters(source, arm), [
-            f"corrected.xml: link inertias are left as they were: {refusal}"
-        ]
-    j = int(np.argmax(off))
-    return result, [
-        "corrected.xml: links as they were found could not be built; it has the nearest that can, whose torque"
-        f" is {off[j]:.3g} {arm.unit('N·m', j)} rms off at joint {j + 1} and less at the others"
-    ]
-
-
-def _nearest(
-    source: MjcfSource, standard: Float[np.ndarray, "dof 10"], problem: Problem
-) -> tuple[Float[np.ndarray, "dof 10"], Float[np.ndarray, " dof"]]:
-    """The nearest links that can be built, and how far their torque is off in the recordings, rms [N m]."""
-    weights = np.concatenate([t.weights for t in problem.traces]) / problem.noise(()).std
-    felt = np.concatenate([t.motion.regressor for t in problem.traces])
-    _, root = np.linalg.qr((weights[:, :, None] * felt).reshape(-1, standard.size))
-    carried = np.stack([link.lumped_standard for link in source.links])
-    changed = np.flatnonzero(np.any(standard != source.standard, axis=1))
-    nearest = nearest_buildable(standard, carried, source.standard, root, changed.tolist())
-    return nearest, np.sqrt(np.mean((felt @ (nearest - standard).ravel()) ** 2, 0))
 
 
 def predict(

@@ -8,6 +8,7 @@ the cutoff of the torque: an autoregressive noise model on samples closer than t
 import dataclasses
 import functools
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.interpolate
@@ -24,6 +25,9 @@ from ..recordings import Recording
 
 WORK_RATE = 100.0
 """Rate of the coarse grid, at most [Hz]."""
+_LONG, _LEAST_RATE = 40.0, 20.0
+"""How long recordings may be together at that rate [s]; of longer ones as many samples are taken, at a lower rate,
+but at no lower one than the motion of an arm needs [Hz]."""
 FINE_RATE = 1000.0
 """Rate of the fine grid, at most [Hz]."""
 POSITION_CUTOFF = 12.0
@@ -170,6 +174,12 @@ class Trace:
         return response[np.argmax(felt) : len(response) - np.argmax(felt)]
 
 
+def work_rate(recordings: Sequence[Recording]) -> float:
+    """Rate of the coarse grid for some recordings, such that long ones fit into memory [Hz]."""
+    seconds = sum(float(r.time[-1] - r.time[0]) for r in recordings)
+    return min(WORK_RATE, max(_LEAST_RATE, WORK_RATE * _LONG / seconds))
+
+
 def prepare(
     recording: Recording,
     arm: Arm,
@@ -178,6 +188,7 @@ def prepare(
     noise: Float[np.ndarray, " dof"] | None = None,
     turning: float | None = None,
     below: float | None = None,
+    coarse: float = WORK_RATE,
 ) -> Trace:
     """A recording on its two grids.
 
@@ -188,8 +199,9 @@ def prepare(
         noise: of the torque [N m], where the recording does not tell.
         turning: velocity over which the arm's Coulomb friction turns [rad/s]; None: as MuJoCo's constraint does.
         below: low-pass of q, where that is lower than what q shows [Hz].
+        coarse: rate of the coarse grid, at most; motion above 0.4 of it is left out, as in the torque [Hz].
     """
-    rough = signals_.prepare(recording, cutoff=3.0, rate=WORK_RATE, trim=0.0 if whole else TRIM)
+    rough = signals_.prepare(recording, cutoff=3.0, rate=coarse, trim=0.0 if whole else TRIM)
     rate, time = rough.rate, rough.time
     spline = scipy.interpolate.CubicSpline(recording.time, recording.q)
     position = spline(np.clip(time, *recording.time[[0, -1]]))
@@ -201,8 +213,7 @@ def prepare(
         cutoff_q = _clearest_cutoff(position, _least_step(recording.q), noise, arm, rate)
     else:
         cutoff_q = position_cutoff(position, noise, arm, rate)
-    if below is not None:
-        cutoff_q = min(cutoff_q, below)
+    cutoff_q = min(cutoff_q, 0.4 * coarse, np.inf if below is None else below)
     q, qd, qdd = _derivatives(position, cutoff_q, rate)
     width = _REST * _velocity_noise(_position_noise(position), cutoff_q, rate)
 

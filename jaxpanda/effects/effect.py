@@ -220,6 +220,10 @@ class AbstractEffect(eqx.Module):
         """Changes that reproduce the effect in MuJoCo natively, by joint attribute; empty if none can."""
         return {}
 
+    def lasting(self, c: Float[np.ndarray, " n"]) -> tuple["AbstractEffect", Float[np.ndarray, " n"]]:
+        """The effect, and its coefficients, as they go on after the recordings."""
+        return self, c
+
     @property
     def dry_width(self) -> Array | float | None:
         """Velocity over which its dry friction changes sign [rad/s]; None where it has no dry friction."""

@@ -421,6 +421,11 @@ class FrictionDrift(AbstractDryFriction):
     def beyond(self, recorded: Sequence[Channels]) -> "FrictionDrift":
         return dataclasses.replace(self, until=max(float(s.t[-1]) for s in recorded))
 
+    def lasting(self, c: Float[np.ndarray, " n"]) -> tuple["FrictionDrift", Float[np.ndarray, " n"]]:
+        end = float(settling(jnp.asarray(jnp.inf), self.time_constant, self.until))
+        changes = np.array([k.name.endswith("_change") for k in self.coefficients])
+        return dataclasses.replace(self, time_constant=1e-6), np.where(changes, end * c, c)
+
     @property
     def steady(self) -> tuple[AbstractDryFriction | ViscousFriction, ...]:
         """The friction that does not change."""
