@@ -43,10 +43,24 @@ UNITS = {
     "phi2": "s/rad",
     "phi3": "rad/s",
 }
-DISSIPATIVE = ("viscous", "coulomb")
-"""Parameters that are not negative in a joint that takes energy out."""
+_HELD_AS = {"viscous": "damping", "coulomb": "frictionloss"}
+"""Parameters that are not negative in a joint that takes energy out, and what they are in a model."""
 
 _COLUMN = {"viscous": lambda qd: qd, "coulomb": jnp.sign, "offset": jnp.ones_like}
+
+
+def least_beyond(
+    names: Sequence[str], known: Mapping[str, Float[np.ndarray, " dof"]], dof: int
+) -> Float[np.ndarray, "dof names"]:
+    """Lower bounds of a law's parameters beside a model that holds some friction (`Arm.damping`, `frictionloss`):
+    what brakes a joint in all is not negative, so that a model with too much may be told to have less."""
+    least = np.full((dof, len(names)), -np.inf)
+    for k, name in enumerate(names):
+        if name in _HELD_AS:
+            least[:, k] = -np.maximum(known.get(_HELD_AS[name], np.zeros(dof)), 0.0)
+        elif name == "phi1":
+            least[:, k] = 0.0
+    return least
 
 
 def check_model(model: str) -> None:

@@ -23,9 +23,9 @@ from .feasible.nearest import are_buildable
 from .feasible.schedule import Device
 from .feasible.solver import NOTHING, STARTS
 from .files import Kind, finite, output_folder, settle, write_json, write_npz
-from .friction import DISSIPATIVE, MODELS, Friction
+from .friction import MODELS, Friction, least_beyond
 from .identification import Identification
-from .identification.condensed import Evidence, least_friction, own_parameters, with_own_parameters
+from .identification.condensed import Evidence, linear_names, own_parameters, with_own_parameters
 from .identification.result import known_physics
 from .inputs import read_json, read_npz
 from .model_file import WHOLE, Part
@@ -53,6 +53,7 @@ _LEAST_SIZE = 0.01  # [m]: where a centre of mass is known
 _DOUBT = (
     1.05  # factor of the torque error, or of the objective's root, that the room for carried bodies may cost
 )
+_LOST = 2.0  # factor of the coefficients' torque error from which links are said to miss it
 _BLOCK = 16384  # starts described at once
 
 
@@ -341,11 +342,12 @@ def retrieve(
     friction, errors = table.friction, {}
     if table.evidence is not None:
         if weighting == "torque" and friction is not None:
-            own = table.evidence.whole.following(table.projection @ phi.ravel(), least_friction(friction))
+            own = table.evidence.whole.following(table.projection @ phi.ravel(), _least(table))
             friction = with_own_parameters(friction, own)
         errors = _torque_errors(
             table, table.evidence, friction, boxes, constraints, carried, phi, weighting, nominal
         )
+    notes += _lost(table, errors.get("relative_error_percent"))
     return Retrieval(
         standard=phi,
         objective=float(np.sum((A @ phi.ravel() - b) ** 2)),
@@ -406,7 +408,7 @@ def _posterior(
     G = np.zeros((len(mean), K.shape[1] + own.size))
     G[: len(K), : K.shape[1]] = K
     G[len(K) :, K.shape[1] :] = np.eye(own.size)
-    least = np.array([0.0 if name.split("_")[0] in DISSIPATIVE else -np.inf for name in names])
+    least = least_beyond(kinds, table.known, bounds.dof).ravel()
     at = np.flatnonzero(told)
     carried = np.zeros((bounds.dof, 10))
     if arm is not None and arm.lumped is not None and are_buildable(phi - np.asarray(arm.lumped)):
@@ -591,7 +593,7 @@ def _torque_errors(
     }
     if weighting != "torque" or table.method != "trajectory" or not evidence.folds:
         return errors
-    squares, least = np.zeros(whole.dof), least_friction(friction)
+    squares, least = np.zeros(whole.dof), _least(table)
     for train, test in evidence.folds:
         estimate, own, sigma = train.classical(len(beta), str(table.settings.get("weighting", "joint")))
         T = train.weigh(len(beta), sigma)
@@ -610,6 +612,10 @@ def _torque_errors(
         "cross_validated_rmse": np.sqrt(squares / samples),
         "cross_validated_relative_error_percent": _percent(np.sqrt(squares), torque),
     }
+
+
+def _least(table: Identification) -> Float[np.ndarray, "dof extra"]:
+    return least_beyond(linear_names(table.friction), table.known, table.dof)
 
 
 def _percent(left: Float[np.ndarray, " dof"], torque: float) -> float:
@@ -716,6 +722,18 @@ def _notes(table: Identification, found: Solutions, weighting: str) -> list[str]
         (infeasible, f"{infeasible} starts ended outside a bound or constraint and do not count"),
     ]
     return [text for count, text in said if count]
+
+
+def _lost(table: Identification, error: float | None) -> list[str]:
+    """A sentence where links that could be built explain the torque worse than the coefficients by far."""
+    least = table.relative_error_percent
+    if error is None or not least or error < _LOST * least:
+        return []
+    return [
+        f"links that could be built leave {error:.2f} % of the torque, the coefficients {least:.2f} %: bounds,"
+        " constraints or what the model holds beside its links (armature, damping, fixed bodies) contradict the"
+        " recording"
+    ]
 
 
 def _load_starts(path: Path) -> Solutions | None:

@@ -26,10 +26,10 @@ from ..recordings import Recording
 WORK_RATE = 100.0
 """Rate of the coarse grid, at most [Hz]."""
 _LONG, _LEAST_RATE = 40.0, 20.0
-"""How long recordings may be together at that rate [s]; of longer ones as many samples are taken, at a lower rate,
-but at no lower one than the motion of an arm needs [Hz]."""
-FINE_RATE = 1000.0
-"""Rate of the fine grid, at most [Hz]."""
+"""How long recordings may be together at that rate [s]; of longer ones as many samples are taken, at a lower
+rate, but at no lower one than the motion of an arm needs [Hz]."""
+FINER = 10.0
+"""Rate of the fine grid over that of the coarse one, at most."""
 POSITION_CUTOFF = 12.0
 """Low-pass of q before it is differentiated, at most [Hz]."""
 _LEAST_CUTOFF, _LEAST_WHOLE = 5.0, 2.5
@@ -217,7 +217,7 @@ def prepare(
     q, qd, qdd = _derivatives(position, cutoff_q, rate)
     width = _REST * _velocity_noise(_position_noise(position), cutoff_q, rate)
 
-    thinnest = max(1, int(rate / FINE_RATE + 1e-6))
+    thinnest = max(1, int(rate / (FINER * coarse) + 1e-6))
     keep = np.arange(0, len(time), thinnest) if whole else rough.keep
     stride = int(np.min(np.diff(keep)))
     thin = next(k for k in range(min(stride, thinnest), 0, -1) if stride % k == 0)

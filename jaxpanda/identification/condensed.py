@@ -18,7 +18,7 @@ from jaxtyping import Float
 from .. import inputs
 from ..errors import InputError
 from ..files import write_npz
-from ..friction import DISSIPATIVE, LINEAR, Friction
+from ..friction import LINEAR, Friction
 from .regression import Masks, Regression, triangle, triangles, weighted_fit
 
 FILE = "identification.npz"
@@ -85,15 +85,15 @@ class Condensed:
         return triangle(np.concatenate(rows))
 
     def following(
-        self, beta: Float[np.ndarray, " base"], least: Float[np.ndarray, " extra"]
+        self, beta: Float[np.ndarray, " base"], least: Float[np.ndarray, "dof extra"]
     ) -> Float[np.ndarray, "dof extra"]:
         """The friction that serves given base parameters best, none of its parameters below `least`."""
         rank = len(beta)
         own = []
-        for R in self.R:
+        for R, low in zip(self.R, least, strict=True):
             left, columns = R[:, -1] - R[:, :rank] @ beta, R[:, rank:-1]
             scale = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
-            found = scipy.optimize.lsq_linear(columns / scale, left, (least * scale, np.inf), method="bvls")
+            found = scipy.optimize.lsq_linear(columns / scale, left, (low * scale, np.inf), method="bvls")
             own.append(found.x / scale)
         return np.array(own)
 
@@ -153,11 +153,6 @@ def linear_names(friction: Friction | None) -> tuple[str, ...]:
     if friction is None:
         return ()
     return ("phi1",) if friction.model == "sigmoid" else LINEAR[friction.model]
-
-
-def least_friction(friction: Friction | None) -> Float[np.ndarray, " extra"]:
-    """Of each of those, what brakes and does not push."""
-    return np.array([0.0 if name in (*DISSIPATIVE, "phi1") else -np.inf for name in linear_names(friction)])
 
 
 def with_own_parameters(friction: Friction, own: Float[np.ndarray, "dof extra"]) -> Friction:

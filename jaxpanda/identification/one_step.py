@@ -12,14 +12,15 @@ $N$ residuals count as $N_e$ independent ones, two a period of the cutoff: both 
 """
 
 import dataclasses
-from collections.abc import Sequence
+import types
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from ..arm import Arm
 from ..feasible import Bounds, Constraint, Solutions, solve
-from ..friction import DISSIPATIVE, MODELS
+from ..friction import MODELS, least_beyond
 from ..parameters import Base
 from .regression import Fit, Masks, Regression, least_squares, triangle, triangles
 
@@ -59,6 +60,7 @@ def feasible_least_squares(
     prior: Prior,
     *,
     cutoff: float,
+    known: Mapping[str, Float[np.ndarray, " dof"]],
     constraints: Sequence[Constraint] = (),
     starts: int,
     seed: int = 0,
@@ -74,6 +76,7 @@ def feasible_least_squares(
         bounds: boxes on the links' parameters.
         prior: what links are expected to be; the first start as well.
         cutoff: of the low-pass behind the regressions [Hz].
+        known: what the model holds beyond rigid links, by name.
         constraints: further ones, as functions of `Links`.
         starts: of the solver.
         seed: same seed, same answer.
@@ -83,7 +86,7 @@ def feasible_least_squares(
         rows = triangles(regressions, masks) @ np.append(-least_squares(regressions, masks, weighting).x, 1.0)
         sigma = sigma * np.linalg.norm(rows) / np.sqrt(len(sigma) * sum(int(m.sum()) for m in masks))
     A, b = problem(regressions, masks, sigma, base, prior, cutoff)
-    low, high = friction_bounds(friction, len(sigma))
+    low, high = friction_bounds(friction, len(sigma), known)
     found = solve(
         A,
         b,
@@ -122,9 +125,9 @@ def problem(
 
 
 def friction_bounds(
-    friction: str, dof: int
+    friction: str, dof: int, known: Mapping[str, Float[np.ndarray, " dof"]] = types.MappingProxyType({})
 ) -> tuple[Float[np.ndarray, " parameters"], Float[np.ndarray, " parameters"]]:
-    """Bounds of the friction's linear parameters, in their columns' order: what brakes is not negative."""
+    """Bounds of the friction's linear parameters beyond what the model holds, in their columns' order."""
     linear = ("phi1",) if friction == "sigmoid" else MODELS[friction]
-    lower = [0.0 if name in (*DISSIPATIVE, "phi1") else -np.inf for name in linear]
-    return np.tile(lower, dof), np.full(dof * len(linear), np.inf)
+    lower = least_beyond(linear, known, dof).ravel()
+    return lower, np.full(len(lower), np.inf)

@@ -6,7 +6,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jaxpanda_kernels.batched import mass_matrix
 from jaxtyping import Bool, Float
 
 from ..arm import Arm
@@ -25,6 +27,7 @@ from .statistics import covariances, determined
 
 STARTS = 16
 """Starts of the one-step fit, the nominal links first: its problem has one basin, so that few are enough."""
+_POSES = 100  # of a recording, in which the inertia at a joint is averaged
 _SHAPE_ROUNDS = 2  # the sigmoid's shape depends on the joints' weights, and these on the shape
 
 
@@ -90,7 +93,8 @@ def identify(
             raise InputError(f"bounds: of {bounds.dof} links, but the arm {arm.name} has {arm.dof}")
         if not prior > 0:
             raise InputError(f"prior: {prior!r} is no positive share of the nominal parameters")
-        options = {"bounds": bounds, "prior": Prior.around(arm, bounds, prior), "cutoff": cutoff}
+        expected = Prior.around(arm, bounds, prior)
+        options = {"bounds": bounds, "prior": expected, "cutoff": cutoff, "known": of_model(arm)}
         solver = partial(_feasible, problem, constraints=constraints, starts=starts, seed=seed, **options)
     else:
         solver = partial(_classical, problem)
@@ -262,6 +266,8 @@ def _result(
         notes.append(f"the motion tells {base.rank} of the arm's {problem.of_arm} base parameters")
     if not np.all(np.isfinite(std[base.rank :])):
         notes.append("the motion does not tell all friction parameters; their standard deviation is null")
+    if method == "trajectory":
+        notes += _armature_doubts(arm, base.projection, beta, problem.signals)
     repairs = Counter()
     for s in problem.signals:
         repairs.update(s.repairs)
@@ -296,6 +302,29 @@ def _result(
         repairs=dict(repairs),
         notes=tuple(notes),
     )
+
+
+def _armature_doubts(
+    arm: Arm,
+    projection: Float[np.ndarray, "base standard"],
+    beta: Float[np.ndarray, " base"],
+    signals: Sequence[Signals],
+) -> list[str]:
+    """A sentence on joints whose armature, which counts as known, is most of the inertia that was recorded:
+    perhaps no links that could be built have as little as it leaves."""
+    links = (np.linalg.pinv(projection) @ beta).reshape(arm.dof, 10)
+    poses = np.concatenate([s.q[:: max(1, len(s.q) // _POSES)] for s in signals])
+    M = mass_matrix(arm.chain, jnp.asarray(links), jnp.asarray(poses))
+    inertia, armature = np.diagonal(np.asarray(M), axis1=1, axis2=2).mean(0), np.asarray(arm.armature)
+    joints = np.flatnonzero((inertia < armature) & (armature > 0))
+    if not len(joints):
+        return []
+    each = [f"{inertia[j]:.2g} beside {armature[j]:.2g} at {arm.joint_names[j]}" for j in joints]
+    return [
+        f"the model's armature is most of the inertia that was recorded, or more [kg m²]: {', '.join(each)};"
+        " if nobody measured it, identify with armature 0, which counts it to the links, or links that could be"
+        " built may not explain the torque"
+    ]
 
 
 def _uncertainty(
