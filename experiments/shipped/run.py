@@ -123,12 +123,11 @@ def ur10e(data: Path) -> Recordings:
 
 
 def iiwa(data: Path) -> Recordings:
-    """One joint moves at a time: sweeps and chirps of joints 1, 3 and 6, and the same joints at other speeds."""
-    of = lambda *names: [run for name in names for run in real.iiwa(data, name)]
-    return (
-        of("friction_joint1_vel_p15", "friction_joint3_vel_p3", "friction_joint6_vel_p3", "J6_chirp"),
-        of("friction_joint1_vel_p6", "friction_joint3_vel_p1", "friction_joint6_vel_1", "J3_chirp"),
-    )
+    """One joint moves at a time, upright: sweeps of joints 1 and 6, and others of the same joints."""
+    of = lambda joint, *speeds: [
+        run for speed in speeds for run in real.iiwa(data, f"friction_joint{joint}_vel_{speed}")
+    ]
+    return [*of(1, "p15", "p6"), *of(6, "p1", "p6")], [*of(1, "p3"), *of(6, "p3", "1")]
 
 
 def gen3(data: Path) -> Recordings:
