@@ -30,6 +30,7 @@ from jaxpanda.identification import (
 )
 from jaxpanda.identification import one_step as feasible_fit
 from jaxpanda.identification import regression as regression_module
+from jaxpanda.identification.condensed import Condensed
 from jaxpanda.identification.regression import Regression, everything, least_squares, regression
 from jaxpanda.identification.statistics import covariances
 from jaxpanda.panda import panda, published
@@ -558,3 +559,12 @@ def test_links_that_explain_less_than_the_coefficients_are_told():
     assert f"leave {links.relative_error_percent:.2f} %" in note
     plain = retrieve(found, arm=arm, starts=8, certificate=False)
     assert not [n for n in plain.notes if "contradict the recording" in n]
+
+
+def test_a_joint_that_never_moved_gets_no_friction():
+    """A joint of a real iiwa stood still but for 1e-294 rad/s, and was exported with frictionloss 3e293."""
+    R = np.triu(np.ones((1, 4, 4)))
+    R[0, :, 1], R[0, :, 2] = 1e-294, [1.0, 2.0, 0.0, 0.0]
+    own = Condensed(R, 100, 1.0).following(np.zeros(1), np.array([[0.0, -np.inf]]))
+    assert own[0, 0] == 0.0
+    assert np.isfinite(own[0, 1])

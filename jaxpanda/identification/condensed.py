@@ -24,6 +24,9 @@ from .regression import Masks, Regression, triangle, triangles, weighted_fit
 FILE = "identification.npz"
 """Stands beside identification.json."""
 
+_UNFELT = 1e-6
+"""Rms of a column of friction below which its joint did not move, in rad/s or of a sign."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Condensed:
@@ -87,14 +90,20 @@ class Condensed:
     def following(
         self, beta: Float[np.ndarray, " base"], least: Float[np.ndarray, "dof extra"]
     ) -> Float[np.ndarray, "dof extra"]:
-        """The friction that serves given base parameters best, none of its parameters below `least`."""
+        """The friction that serves given base parameters best, none of its parameters below `least`; none where a
+        joint never moved."""
         rank = len(beta)
         own = []
         for R, low in zip(self.R, least, strict=True):
             left, columns = R[:, -1] - R[:, :rank] @ beta, R[:, rank:-1]
-            scale = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
-            found = scipy.optimize.lsq_linear(columns / scale, left, (low * scale, np.inf), method="bvls")
-            own.append(found.x / scale)
+            scale, x = np.linalg.norm(columns, axis=0), np.zeros(columns.shape[1])
+            told = scale > _UNFELT * np.sqrt(self.samples)
+            if told.any():
+                scale, bounds = scale[told], (low[told] * scale[told], np.inf)
+                x[told] = (
+                    scipy.optimize.lsq_linear(columns[:, told] / scale, left, bounds, method="bvls").x / scale
+                )
+            own.append(x)
         return np.array(own)
 
 
