@@ -430,7 +430,7 @@ def test_one_step_finds_links_that_could_be_built_and_the_convex_optimum(monkeyp
     monkeypatch.setattr(feasible_fit, "problem", lambda *args: posed.setdefault("problem", original(*args)))
     recording = virtual(panda(), 14.0, noise=2 * NOISE)
     result = identify(recording, panda(), method="one_step", folds=0)
-    lower, _ = feasible_fit.friction_bounds("coulomb_viscous_offset", 7)
+    lower, _ = feasible_fit.friction_bounds("coulomb_viscous_offset", 7, {})
     least = clarabel_optimum(*posed["problem"], Bounds.panda(), lower)
     assert result.settings["objective"] <= least * (1 + 1e-3)
     assert result.settings["max_violation"] == 0

@@ -82,6 +82,8 @@ def test_long_recordings_are_taken_at_a_lower_rate_together():
     assert rows == pytest.approx([4000, 2000, 1600], rel=0.05)
     short = [record(0, seconds=20.0)] * 2
     assert work_rate(short) == WORK_RATE
+    one_row = Recording("one.csv", np.zeros(1), np.zeros((1, 7)), tau=np.zeros((1, 7)))
+    assert work_rate([one_row]) == WORK_RATE  # how short it is says who reads it
 
 
 def test_a_prediction_keeps_motion_that_is_fast_but_above_the_noise_of_q():

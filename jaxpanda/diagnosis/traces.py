@@ -177,7 +177,7 @@ class Trace:
 def work_rate(recordings: Sequence[Recording]) -> float:
     """Rate of the coarse grid for some recordings, such that long ones fit into memory [Hz]."""
     seconds = sum(float(r.time[-1] - r.time[0]) for r in recordings)
-    return min(WORK_RATE, max(_LEAST_RATE, WORK_RATE * _LONG / seconds))
+    return max(_LEAST_RATE, WORK_RATE * _LONG / max(seconds, _LONG))
 
 
 def prepare(

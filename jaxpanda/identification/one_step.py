@@ -12,7 +12,6 @@ $N$ residuals count as $N_e$ independent ones, two a period of the cutoff: both 
 """
 
 import dataclasses
-import types
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -125,7 +124,7 @@ def problem(
 
 
 def friction_bounds(
-    friction: str, dof: int, known: Mapping[str, Float[np.ndarray, " dof"]] = types.MappingProxyType({})
+    friction: str, dof: int, known: Mapping[str, Float[np.ndarray, " dof"]]
 ) -> tuple[Float[np.ndarray, " parameters"], Float[np.ndarray, " parameters"]]:
     """Bounds of the friction's linear parameters beyond what the model holds, in their columns' order."""
     linear = ("phi1",) if friction == "sigmoid" else MODELS[friction]
