@@ -2,13 +2,16 @@ r"""What a recording's torque column is, asked before any physics: inverse dynam
 
 Every joint is compared by itself. Samples of its low-passed torque are explained as
 
-$$ \tau = \mu + B\,x + e, \quad x \sim N(0, 1), \quad e \sim N(0, a^2 R_\rho), $$
+$$ \tau = \mu + B\,x + F\,(s + C\,z) + e, \quad x, z \sim N(0, 1), \quad e \sim N(0, a^2 R_\rho), $$
 
 with $\mu$ the torque of the user's model under a reading of the column. B is what may well be wrong in a model
-that is read rightly: links, a payload, friction and whatever load it holds at rest, an offset, rotor inertia, a
-spring, a delay, a gain and a slight tilt, all with wide deviations. The error e is correlated over a time $\rho$;
-its size and $\rho$ are integrated out, so that unmodelled physics only makes e larger, whatever the reading. A
-column in another unit or of another joint is far from any of this, and its reading gains many nats.
+that is read rightly: links, a payload, viscous friction, an offset, rotor inertia, a spring, a delay, a gain and
+a slight tilt, all with wide deviations. F is the size of dry friction: s the sign of velocity, C how far friction
+may be from that, with one number for each rest, in which it holds whatever load is left to it, up to about F. So
+a rest says no more than one sample does, and friction holds no load at rest that it would not brake in motion.
+The error e is correlated over a time $\rho$. Its size a, $\rho$, F and the size of x are integrated out, so that
+unmodelled physics only makes e larger, whatever the reading. A column in another unit or of another joint is far
+from any of this, and its reading gains many nats.
 
 The likeliest reading is told only where its evidence beats the plain one's by far, more for each choice it has
 (`_NEEDS`), and the posterior of the plain one is next to none (`SURE`); its own posterior is its confidence.
@@ -62,9 +65,9 @@ _STILL = 0.02
 """Travel below which a joint is not judged [rad]: friction at rest may carry its load."""
 _MEMORIES = np.array([0.05, 0.2, 0.8, 3.2])
 """Correlation times of the error [s]."""
-_SIZES = np.exp(np.arange(np.log(1e-6), np.log(2e4), 0.5))
+_SIZES = np.exp(np.arange(np.log(1e-4), np.log(30), 0.5))
 """Sizes of the error, in the size of the joint's torque; the least are none, lest a factor stand in for them."""
-_SHARES = np.geomspace(1e-3, 8.0, 12)
+_SHARES = np.geomspace(1e-3, 8.0, 9)
 """Shares of the deviations below that a joint may have. Most models are better than that, and some far worse: for
 these a factor would be told, as it makes the deviations larger."""
 _WHITE = 0.03
@@ -76,9 +79,17 @@ _LOAD = 0.15, 0.1
 _GAIN, _TILT, _DELAY = 0.25, 0.1, 0.05
 """Deviations of a sensor's gain, as a share; of a base that is not level [rad]; of a delay [s]."""
 _FREE = 1.0
-"""Deviation of friction of each kind, offset, rotor inertia and spring, in the size of the joint's torque."""
-_RESTS = 0.02
-"""Velocity below which dry friction may hold any load [rad/s]."""
+"""Deviation of friction but dry, offset, rotor inertia and spring, in the size of the joint's torque."""
+_FRICTIONS = np.geomspace(0.003, 0.8, 8)
+"""Sizes of dry friction, in the size of the arm's largest joint torque: the drive's, whatever a joint bears."""
+_SLIDING, _HELD = 0.3, 0.7
+"""Deviation of dry friction in motion from that size, and of what it holds in a rest from none, as shares."""
+_RESTS = 0.005
+"""Velocity at which dry friction holds a load in part [rad/s]."""
+_RESTING = 0.1
+"""Share of what friction may hold, from which a sample belongs to a rest."""
+_LONGEST = 8
+"""Rests of a joint, the longest, with a number each; others are short, and friction there may be anything."""
 _OFF = 0.5
 """Share of a column that the model's torque leaves, at least, where the column is another joint's."""
 _SMALL = 0.1
@@ -171,7 +182,8 @@ class _Samples:
         """For each correlation time of the error: what turns it into white noise, and the logarithm of its
         correlation's determinant."""
         apart, out = np.abs(self.time[:, None] - self.time), []
-        for memory in _MEMORIES:
+        least = min(float(np.median(np.diff(self.time))) / 3, _MEMORIES[-1])  # shorter ones are all white
+        for memory in _MEMORIES[least <= _MEMORIES]:
             L = np.linalg.cholesky((1 - _WHITE) * np.exp(-apart / memory) + _WHITE * np.eye(len(apart)))
             white = scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True)
             out.append((white, float(2 * np.sum(np.log(np.diag(L))))))
@@ -295,7 +307,7 @@ class _Model:
         place = np.argsort(order)
         self.q, self.qd, self.qdd = (x[:, place] for x in (samples.q, samples.qd, samples.qdd))
         self.moving: list[int] = np.sort(order[samples.moving]).tolist()
-        self._bases: dict[int, list[tuple[np.ndarray, np.ndarray, float]]] = {}
+        self._bases: dict[int, list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]] = {}
 
     @functools.cached_property
     def parts(self) -> tuple[Float[np.ndarray, "n dof standard"], Float[np.ndarray, "3 n dof standard"]]:
@@ -309,7 +321,17 @@ class _Model:
         arm = self.arm
         known = np.asarray(arm.armature) * self.qdd + np.asarray(arm.damping) * self.qd
         known = known + np.asarray(arm.stiffness) * (self.q - np.asarray(arm.springref))
-        return known + np.asarray(arm.frictionloss) * np.tanh(self.qd / 0.02)
+        return known + self.dry
+
+    @functools.cached_property
+    def sliding(self) -> Float[np.ndarray, "n dof"]:
+        """Sign of each joint's velocity, smoothed."""
+        return np.tanh(self.qd / 0.02)
+
+    @functools.cached_property
+    def dry(self) -> Float[np.ndarray, "n dof"]:
+        """Torque of the dry friction that the model holds [N m]."""
+        return np.asarray(self.arm.frictionloss) * self.sliding
 
     @functools.cached_property
     def inertial(self) -> Float[np.ndarray, "n dof"]:
@@ -342,63 +364,99 @@ class _Model:
         payload[-10:] = np.diag([mass, *3 * [mass * reach], *6 * [mass * reach**2]])
         return np.concatenate([np.asarray(scipy.linalg.block_diag(*blocks)), payload], 1)
 
-    def columns(self, j: int) -> Float[np.ndarray, "n p"]:
-        """B of joint j."""
+    @property
+    def frictions(self) -> Float[np.ndarray, " frictions"]:
+        """Sizes that dry friction may have, F [N m]."""
+        return _FRICTIONS * self.size.max()
+
+    def columns(self, j: int) -> tuple[Float[np.ndarray, "n p"], Float[np.ndarray, "n r"]]:
+        """B and C of joint j."""
         size, qd = self.size[j], self.qd[:, j]
         whole = self.parts[0][:, j] + np.tensordot(self.gravity, self.parts[1][:, :, j], 1)
         unit = lambda x: x / max(float(np.sqrt(np.mean(x**2))), 1e-9)
         joint = [
             unit(qd),
-            unit(np.tanh(qd / 0.02)),
             unit(np.tanh(qd / 0.2)),
             np.ones(len(qd)),
             unit(self.qdd[:, j]),
             unit(self.q[:, j] - self.q[:, j].mean()),
         ]
         slow = np.gradient(self.torque[:, j], self.samples.time)
-        at_rest = np.diag(_FREE * size * np.exp(-0.5 * (qd / _RESTS) ** 2))
+        held = np.exp(-0.5 * (qd / _RESTS) ** 2)
+        rest = np.where(held > _RESTING, np.cumsum(np.diff(held > _RESTING, prepend=False)), 0)
+        samples = np.bincount(rest)
+        longest = [k for k in np.argsort(-samples) if k and samples[k] > 1][:_LONGEST]
+        in_rests = held[:, None] * (rest[:, None] == longest)
+        short = np.diag(held)[:, (held > 1e-3) & ~np.isin(rest, longest)]
         g = float(np.linalg.norm(self.gravity))
         tilt = self.weight[:, j] @ _across(self.gravity) * (g * _TILT) if g > 0 else np.zeros((len(qd), 0))
-        return np.column_stack(
+        B = np.column_stack(
             [
                 whole @ self.spread,
                 _FREE * size * np.stack(joint, 1),
                 _GAIN * self.torque[:, j],
                 _DELAY * slow,
                 tilt,
-                at_rest[:, np.abs(qd) < 4 * _RESTS],
+                _FREE * size * short,
             ]
         )
+        return B, np.column_stack([_SLIDING * self.sliding[:, j], _HELD * in_rests])
 
-    def bases(self, j: int) -> list[tuple[np.ndarray, np.ndarray, float]]:
-        """For each correlation time of the error: what turns samples into independent ones, their variances by
-        B, and the logarithm of the determinant."""
+    def bases(self, j: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
+        """For each correlation time of the error: what turns samples into ones that are independent but for dry
+        friction, their variances by B, C turned, and the logarithm of the determinant."""
         if j in self._bases:
             return self._bases[j]
-        B, out = self.columns(j), []
+        (B, C), out = self.columns(j), []
         for white, determinant in self.samples.errors:
             X = white @ B
             variances, U = np.linalg.eigh(X @ X.T)
-            out.append((U.T @ white, np.maximum(variances, 0.0), determinant))
+            turned = U.T @ white
+            out.append((turned, np.maximum(variances, 0.0), turned @ C, determinant))
         self._bases[j] = out
         return out
+
+    def products(self, j: int, vectors: Float[np.ndarray, "n k"]) -> tuple[np.ndarray, np.ndarray]:
+        r"""$v_a^\top V^{-1} v_b$ of vectors and $\log\det V$, V the covariance of joint j's column.
+
+        Returns:
+            products `(memories, frictions, hypotheses, k, k)` and logarithms `(memories, frictions, hypotheses)`;
+            by Woodbury's identity, as C has few columns.
+        """
+        F2 = np.square(self.frictions)[:, None, None]
+        products, determinants = [], []
+        for turned, variances, C, determinant in self.bases(j):
+            w = 1 / _totals(variances, self.size[j])
+            X = np.column_stack([turned @ vectors, C])
+            k, n = vectors.shape[1], X.shape[1]
+            XX = (np.einsum("na,nb->abn", X, X).reshape(n * n, -1) @ w).T.reshape(-1, n, n)
+            sizes, U = np.linalg.eigh(XX[:, k:, k:])
+            grows = F2 * np.maximum(sizes, 0.0)
+            CX = np.swapaxes(U, 1, 2) @ XX[:, k:, :k]
+            by_friction = np.swapaxes(CX, 1, 2) @ ((F2 / (1 + grows))[..., None] * CX)
+            products.append(XX[:, :k, :k] - by_friction)
+            determinants.append(determinant - np.sum(np.log(w), 0) + np.sum(np.log1p(grows), -1))
+        return np.array(products), np.array(determinants)
 
     def joint_evidence(
         self, j: int, column: Float[np.ndarray, " n"], mean: Float[np.ndarray, " n"], factors: np.ndarray
     ) -> Float[np.ndarray, " factors"]:
         """Logarithm of the probability of a column, were it each factor times joint j's torque [nats].
 
-        What the model holds beyond its links may be a stand-in for nothing: it is there or not, alike likely.
+        What the model holds beyond its links and dry friction may be a stand-in for nothing: it is there or not,
+        alike likely. Of dry friction any size is, whatever the model holds.
         """
-        means = [mean, mean - self.known[:, j]] if np.any(self.known[:, j]) else [mean]
-        said = []
-        for turned, variances, determinant in self.bases(j):
-            w = 1 / _totals(variances, self.size[j])
-            y = turned @ column
-            yy, constant = y**2 @ w, determinant - np.sum(np.log(w), 0)
-            for m in (turned @ each for each in means):
-                square = yy[:, None] / factors**2 - 2 * ((y * m) @ w)[:, None] / factors
-                said.append(-0.5 * (square + (m**2 @ w + constant)[:, None]))
+        plain = mean - self.dry[:, j]
+        means = [plain]
+        if np.any(self.known[:, j] != self.dry[:, j]):
+            means.append(mean - self.known[:, j])
+        P, determinants = self.products(j, np.column_stack([column, self.sliding[:, j], *means]))
+        F, said = self.frictions[:, None], []
+        for m in range(2, 2 + len(means)):
+            yy, ym = P[..., 0, 0], P[..., 0, m] + F * P[..., 0, 1]
+            mm = P[..., m, m] + 2 * F * P[..., 1, m] + F**2 * P[..., 1, 1] + determinants
+            yy, ym, mm = (x.reshape(-1, 1) for x in (yy, ym, mm))
+            said.append(-0.5 * (yy / factors**2 - 2 * ym / factors + mm))
         said = np.concatenate(said)
         n = len(column)
         return (
@@ -690,18 +748,16 @@ def _on_sphere(
 
 def _informed(model: _Model, j: int, H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What joint j tells of gravity, by its likeliest error."""
-    G, r = model.weight[:, j], model.tau[:, j] - model.inertial[:, j]
-    said, found = [], []
-    for turned, variances, determinant in model.bases(j):
-        A, y = turned @ G, turned @ r
-        w = 1 / _totals(variances, model.size[j])
-        HA, hA = np.einsum("na,nb,nh->hab", A, A, w), np.einsum("na,n,nh->ha", A, y, w)
-        K = HA + np.eye(3) / _EARTH**2
-        fit = np.einsum("ha,ha->h", hA, np.linalg.solve(K, hA[..., None])[..., 0])
-        said.append(0.5 * (fit - y**2 @ w + np.sum(np.log(w), 0) - determinant - np.linalg.slogdet(K)[1]))
-        found.append((HA, hA))
-    memory, error = np.unravel_index(np.argmax(said), np.shape(said))
-    return H + found[memory][0][error], h + found[memory][1][error]
+    r = model.tau[:, j] - model.inertial[:, j] + model.dry[:, j]
+    P, determinants = model.products(j, np.column_stack([model.weight[:, j], r, model.sliding[:, j]]))
+    F = model.frictions[:, None]
+    HA, hA = P[..., :3, :3], P[..., :3, 3] - F[..., None] * P[..., :3, 4]
+    rr = P[..., 3, 3] - 2 * F * P[..., 3, 4] + F**2 * P[..., 4, 4]
+    K = HA + np.eye(3) / _EARTH**2
+    fit = np.sum(hA * np.linalg.solve(K, hA[..., None])[..., 0], -1)
+    said = fit - rr - determinants - np.linalg.slogdet(K)[1]
+    likeliest = np.unravel_index(np.argmax(said), said.shape)
+    return H + HA[likeliest], h + hA[likeliest]
 
 
 def _angle(g: np.ndarray, other: np.ndarray) -> float:
