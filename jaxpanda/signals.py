@@ -256,15 +256,14 @@ def blocks_many(
 
     Recordings that share motion share their blocks. A fold holds out one block of each of `rounds` parts of a
     recording: several leave something of every time in training. There are fewer where blocks would be shorter
-    than thrice the guard.
+    than thrice the guard. Time of which nothing is kept, as in a gap, belongs to no block.
     """
     clocks = _clocks(signals)
     result: list[list[Split]] = []
     for k in range(folds):
         splits = []
-        for s, (offset, start, length, cyclic) in zip(signals, clocks, strict=True):
-            phase = s.times - offset - start
-            phase = np.mod(phase, length) if cyclic else phase
+        for s, clock in zip(signals, clocks, strict=True):
+            phase, length, cyclic = clock.recorded(s.times), clock.length, clock.cyclic
             test, near = np.zeros(len(phase), bool), np.zeros(len(phase), bool)
             count = folds * max(1, min(rounds, int(length / (3 * guard * folds)) if guard else rounds))
             for block in range(k, count, folds):
@@ -278,7 +277,7 @@ def blocks_many(
     for k, splits in enumerate(result):
         if not any(test.any() for _, test in splits) or not any(train.any() for train, _ in splits):
             raise InputError(
-                f"{signals[0].name}: too short for {folds} folds (fold {k + 1} is empty): use fewer folds"
+                f"{signals[0].name}: too few samples for {folds} folds (fold {k + 1} is empty): record longer"
             )
     return result
 
@@ -398,8 +397,38 @@ def _kept(
     return keep
 
 
-def _clocks(signals: Sequence[Signals]) -> list[tuple[float, float, float, bool]]:
-    """For each recording: offset to the clock it shares; that clock's start, length, and if it is cyclic."""
+@dataclasses.dataclass(frozen=True)
+class _Clock:
+    """Time of a motion, which recordings that share it share."""
+
+    offset: float
+    """Of the recording's clock to the shared one [s]."""
+    start: float
+    """[s]"""
+    cycle: float | None
+    """After which the motion repeats itself [s]."""
+    length: float
+    """Recorded time: of a cycle or of the whole [s]."""
+    gaps: Float[np.ndarray, "gaps 2"]
+    """Where nothing is kept of any of the recordings: from and to, since the start [s]."""
+
+    @property
+    def cyclic(self) -> bool:
+        return self.cycle is not None
+
+    def phase(self, time: Float[np.ndarray, " kept"]) -> Float[np.ndarray, " kept"]:
+        """Time since the start, or since the start of its cycle [s]."""
+        since = time - self.offset - self.start
+        return since if self.cycle is None else np.mod(since, self.cycle)
+
+    def recorded(self, time: Float[np.ndarray, " kept"]) -> Float[np.ndarray, " kept"]:
+        """Recorded time since then: gaps take none [s]."""
+        phase = self.phase(time)
+        return phase - sum(np.clip(phase - low, 0, high - low) for low, high in self.gaps)
+
+
+def _clocks(signals: Sequence[Signals]) -> list[_Clock]:
+    """Each recording's clock."""
     offsets = [0.0] * len(signals)
     group = list(range(len(signals)))
     for a, b in itertools.combinations(range(len(signals)), 2):
@@ -414,7 +443,15 @@ def _clocks(signals: Sequence[Signals]) -> list[tuple[float, float, float, bool]
         start = min(signals[j].times[0] - offsets[j] for j in members)
         end = max(signals[j].times[-1] - offsets[j] for j in members)
         cycle = next((p for j in members if (p := signals[j].period) is not None), None)
-        clocks.append((offset, start, end - start if cycle is None else cycle, cycle is not None))
+        whole = [_Clock(offsets[j], start, cycle, 0.0, np.zeros((0, 2))) for j in members]
+        phases = np.sort(
+            np.concatenate([clock.phase(signals[j].times) for j, clock in zip(members, whole, strict=True)])
+        )
+        step = max(1 / signals[j].output_rate for j in members)
+        after = np.flatnonzero(np.diff(phases) > max(LONGEST_GAP, 2 * step))
+        gaps = np.column_stack([phases[after] + step, phases[after + 1]])
+        length = (end - start if cycle is None else cycle) - float(np.sum(gaps[:, 1] - gaps[:, 0]))
+        clocks.append(_Clock(offset, start, cycle, length, gaps))
     return clocks
 
 

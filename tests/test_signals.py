@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -246,8 +248,21 @@ def test_blocks_in_rounds_leave_something_of_every_time_in_training(seconds, rou
     assert np.all(tested == 1)
 
 
+def test_a_gap_takes_no_time_of_blocks():
+    """A fifth of the recording would lie in it: that fold would be empty, and the others of unequal size."""
+    whole = recording(12.0)
+    rows = (whole.time < 5.0) | (whole.time > 8.0)
+    made = prepare(dataclasses.replace(whole, time=whole.time[rows], q=whole.q[rows], tau=whole.tau[rows]))
+    tested = np.zeros(len(made.keep), int)
+    for train, test in blocks(made, folds=5, guard=0.1):
+        tested += test
+        assert np.sum(test) == pytest.approx(len(test) / 5, abs=2)
+        assert np.min(np.abs(made.times[train][:, None] - made.times[test][None, :])) > 0.09
+    assert np.all(tested == 1)
+
+
 def test_more_folds_than_samples_are_refused():
-    with pytest.raises(InputError, match="use fewer folds"):
+    with pytest.raises(InputError, match="too few samples for 500 folds"):
         blocks(prepare(recording(2.0)), folds=500)
 
 
