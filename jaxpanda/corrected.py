@@ -185,7 +185,7 @@ class Corrected(eqx.Module):
             + np.asarray(self.frictionloss_change) * held_sign
         )
         if np.any(np.asarray(self.change)):
-            tau = tau + motion.regressor @ np.asarray(self.change).ravel()
+            tau = tau + motion.of_links(np.asarray(self.change))
         pairs = list(zip(self.effects, self.coefficients, strict=True))
         for last in (False, True):
             stretches = Stretches(dataclasses.replace(channels, shown=tau.copy() if last else None))

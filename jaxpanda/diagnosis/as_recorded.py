@@ -21,6 +21,8 @@ GEAR = 0.01
 """Velocity over which the friction of a gear turns [rad/s]."""
 CUTOFFS = (40.0, 30.0, 20.0, 15.0, 10.0, 7.0, 5.0)
 """Low-passes of the motion that are tried [Hz]."""
+LONG = 120.0
+"""What of a recording is compared, from its start, at most [s]: more says the same again."""
 MOST = 0.5
 """Of the squared error of predictions, what must be motion that the torque does not show."""
 
@@ -29,6 +31,7 @@ def as_recorded(
     recordings: Sequence[Recording], corrected: Corrected, noise: Float[np.ndarray, " dof"]
 ) -> Corrected:
     """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings."""
+    recordings = [_beginning(recording) for recording in recordings]
     best, (measured, torque) = corrected, _compared(recordings, corrected, noise)
     squares = lambda x: np.maximum(np.sum((measured - x) ** 2, 0), 1e-300)
     if np.any(np.asarray(corrected.arm.frictionloss + corrected.frictionloss_change)):
@@ -94,6 +97,16 @@ def predicted(
         out[cutoff] = trace, corrected.measured_torque(trace.motion, trace.channels, trace.sign)
     torque = np.stack([out[cutoff][1][:, joint] for joint, cutoff in enumerate(cutoffs)], 1)
     return out[cutoffs[0]][0], torque
+
+
+def _beginning(recording: Recording) -> Recording:
+    """The first `LONG` of a recording."""
+    count = int(np.searchsorted(recording.time, recording.time[0] + LONG, "right"))
+    if count == recording.samples:
+        return recording
+    channels = {name: getattr(recording, name) for name in ("time", "q", "qd", "tau", "stamps")}
+    cut = {name: x[:count] for name, x in channels.items() if x is not None}
+    return dataclasses.replace(recording, **cut, row=None)
 
 
 def _compared(

@@ -1,5 +1,6 @@
 """What effects are evaluated on: the motion of an arm on a uniform grid, and the nominal model's torque in it."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -70,6 +71,12 @@ class Motion:
     def regressor(self) -> Float[np.ndarray, "time dof standard"]:
         """Regressor of the standard parameters, ten a link."""
         return self._over(_regressor, self.q, self.qd, self.qdd)
+
+    def of_links(self, standard: Float[np.ndarray, "dof 10"]) -> Float[np.ndarray, "time dof"]:
+        """Torque of the links alone, were these their standard parameters, or a change of them [N m]: the
+        regressor times them, without its time and memory."""
+        arm = dataclasses.replace(self.arm, standard=jnp.asarray(standard))
+        return _chunked(_rigid_torque, arm, self.q, self.qd, self.qdd)
 
     @functools.cached_property
     def gravity_columns(self) -> Float[np.ndarray, "time dof 3"]:
