@@ -70,6 +70,26 @@ def test_prediction_takes_no_more_of_fast_motion_than_the_torque_showed():
     np.testing.assert_array_equal(np.delete(error(found), [1, 3]), np.delete(error(plain), [1, 3]))
 
 
+def test_of_a_long_recording_the_beginning_is_compared(monkeypatch):
+    """Friction that turns otherwise in what follows, and is stronger there, decides nothing if left out."""
+    arm, zeros = dataclasses.replace(Arm.panda(), frictionloss=jnp.full(7, 0.5)), jnp.zeros(7)
+    corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
+    first = rubbing(arm, 0.02)
+    later = rubbing(dataclasses.replace(arm, frictionloss=jnp.full(7, 5.0)), None)
+    half = len(first.time) // 2
+    both = dataclasses.replace(first, tau=np.concatenate([first.tau[:half], later.tau[half:]]))
+    assert as_recorded([both], corrected, NOISE).turning is None
+    monkeypatch.setattr("jaxpanda.diagnosis.as_recorded.LONG", float(first.time[half - 1]))
+    assert as_recorded([both], corrected, NOISE).turning == GEAR
+
+
+def test_torque_of_changed_links_is_that_of_the_regressor():
+    arm = Arm.panda()
+    motion = prepare(reversing(arm, (), 6.0), arm).motion
+    change = np.random.default_rng(7).normal(size=(7, 10))
+    np.testing.assert_allclose(motion.of_links(change), motion.regressor @ change.ravel(), atol=1e-9)
+
+
 def test_effects_that_make_the_recordings_own_torque_worse_are_named():
     """An armature that is not there follows the sharp turns; damping that is there stays beside it."""
     arm = dataclasses.replace(Arm.panda(), damping=jnp.full(7, 0.5))
