@@ -21,11 +21,10 @@ from ..arm import Arm
 from ..errors import InputError
 from ..friction import columns
 from ..parameters import Base, base_parameters
-from ..signals import Signals
+from ..signals import STILL, Signals
 
 _CHUNK = 1024  # samples whose regressor is evaluated at once; bounds the memory
 _AT_ONCE = 2**26  # numbers of the rows of some joints at the full rate; 512 MiB of them
-_REST = 0.01  # [rad/s, m/s]: a joint that never exceeds it has not moved
 _REWEIGHTINGS = 2  # after the first, joint weights change by less than a percent
 _LEAST_SIGMA = 1e-9  # of the torque: below it a residual is round-off, as on noise-free data
 UNDETERMINED = 1e-9
@@ -87,8 +86,12 @@ def regression(signals: Signals, arm: Arm, base: Base, friction: str) -> Regress
 
 
 def moving(signals: Signals) -> Float[np.ndarray, "time dof"]:
-    """Velocities [rad/s], zero for a joint that rests throughout: its encoder's noise is no motion."""
-    return np.where(np.max(np.abs(signals.qd), axis=0) > _REST, signals.qd, 0.0)
+    """Velocities [rad/s], zero for a joint that stands still throughout.
+
+    Noise of its encoder is no motion. Nor does friction brake a joint that trembles while others move: it yields
+    by as much without sliding, and carries any load.
+    """
+    return np.where(np.ptp(signals.q[signals.keep], axis=0) >= STILL, signals.qd, 0.0)
 
 
 def with_columns(
