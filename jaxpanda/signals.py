@@ -437,22 +437,25 @@ def _clocks(signals: Sequence[Signals]) -> list[_Clock]:
             move, joining = offsets[a] + found[0] - offsets[b], group[b]
             for j in [j for j, g in enumerate(group) if g == joining]:
                 offsets[j], group[j] = offsets[j] + move, group[a]
-    clocks = []
-    for i, offset in enumerate(offsets):
-        members = [j for j in range(len(signals)) if group[j] == group[i]]
-        start = min(signals[j].times[0] - offsets[j] for j in members)
-        end = max(signals[j].times[-1] - offsets[j] for j in members)
-        cycle = next((p for j in members if (p := signals[j].period) is not None), None)
-        whole = [_Clock(offsets[j], start, cycle, 0.0, np.zeros((0, 2))) for j in members]
-        phases = np.sort(
-            np.concatenate([clock.phase(signals[j].times) for j, clock in zip(members, whole, strict=True)])
-        )
-        step = max(1 / signals[j].output_rate for j in members)
-        after = np.flatnonzero(np.diff(phases) > max(LONGEST_GAP, 2 * step))
-        gaps = np.column_stack([phases[after] + step, phases[after + 1]])
-        length = (end - start if cycle is None else cycle) - float(np.sum(gaps[:, 1] - gaps[:, 0]))
-        clocks.append(_Clock(offset, start, cycle, length, gaps))
-    return clocks
+    clocks: dict[int, _Clock] = {}
+    for g in set(group):
+        members = [j for j in range(len(signals)) if group[j] == g]
+        clocks[g] = _shared_clock([signals[j] for j in members], [offsets[j] for j in members])
+    return [dataclasses.replace(clocks[g], offset=offset) for g, offset in zip(group, offsets, strict=True)]
+
+
+def _shared_clock(signals: Sequence[Signals], offsets: Sequence[float]) -> _Clock:
+    """The clock of recordings that share their motion; its offset is nobody's."""
+    start = min(s.times[0] - offset for s, offset in zip(signals, offsets, strict=True))
+    end = max(s.times[-1] - offset for s, offset in zip(signals, offsets, strict=True))
+    cycle = next((s.period for s in signals if s.period is not None), None)
+    whole = _Clock(0.0, start, cycle, end - start if cycle is None else cycle, np.zeros((0, 2)))
+    phases = [whole.phase(s.times - offset) for s, offset in zip(signals, offsets, strict=True)]
+    phases = np.sort(np.concatenate(phases))
+    step = max(1 / s.output_rate for s in signals)
+    before = np.flatnonzero(np.diff(phases) > max(LONGEST_GAP, 2 * step))
+    gaps = np.column_stack([phases[before] + step, phases[before + 1]])
+    return dataclasses.replace(whole, length=whole.length - float(np.sum(gaps[:, 1] - gaps[:, 0])), gaps=gaps)
 
 
 def _shift(
