@@ -65,8 +65,9 @@ _STILL = 0.02
 """Travel below which a joint is not judged [rad]: friction at rest may carry its load."""
 _MEMORIES = np.array([0.05, 0.2, 0.8, 3.2])
 """Correlation times of the error [s]."""
-_SIZES = np.exp(np.arange(np.log(1e-4), np.log(30), 0.5))
-"""Sizes of the error, in the size of the joint's torque; the least are none, lest a factor stand in for them."""
+_SIZES = np.exp(np.r_[np.arange(-9.0, 3.5, 0.5), np.arange(3.5, 10.0, 1.0)])
+"""Sizes of the error, in the size of the joint's torque: the least are none, lest a factor stand in for them; the
+largest of torque that nothing explains, lest its unit be doubted."""
 _SHARES = np.geomspace(1e-3, 8.0, 9)
 """Shares of the deviations below that a joint may have. Most models are better than that, and some far worse: for
 these a factor would be told, as it makes the deviations larger."""
