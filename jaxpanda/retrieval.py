@@ -492,6 +492,11 @@ def _equations(
         if not table.reliable.any():
             raise InputError("coefficients: none is reliable, so there is nothing to retrieve from")
         return A[table.reliable], b[table.reliable]
+    if table.evidence is not None and table.method == "trajectory":
+        whole = table.evidence.whole  # a covariance of what is told next to what is not has too many digits
+        _, _, sigma = whole.classical(len(b), str(table.settings.get("weighting", "joint")))
+        T = whole.weigh(len(b), sigma)
+        return T @ A, T @ b
     covariance = table.classical_covariance
     if covariance is None:
         if table.std is None or not np.all((table.std > 0) & np.isfinite(table.std)):
