@@ -82,6 +82,11 @@ class Signals:
         return self.time[self.keep]
 
     @property
+    def moves(self) -> Bool[np.ndarray, " dof"]:
+        """Joints that do not stand still throughout."""
+        return np.ptp(self.q[self.keep], axis=0) >= STILL
+
+    @property
     def output_rate(self) -> float:
         """Of the output grid [Hz]."""
         return self.rate / float(np.min(np.diff(self.keep), initial=len(self.time)))

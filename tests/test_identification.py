@@ -243,6 +243,17 @@ def _filtered_friction(signals) -> np.ndarray:
     return np.sqrt(np.mean(signals.lowpass(np.asarray(friction)) ** 2, 0))
 
 
+def test_a_joint_that_only_trembles_shows_no_friction():
+    """An iiwa's upright joints yielded by 2 mrad as others moved, and got damping of 106 N m s/rad."""
+    recording = virtual(panda(), 4.0)
+    q = recording.q.copy()
+    q[:, 1] = q[0, 1] + 1e-3 * np.sin(2 * np.pi * 3.0 * recording.time)  # up to 19 mrad/s
+    arm, signals = panda(), prepare(dataclasses.replace(recording, q=q))
+    base = arm_base_parameters(arm)
+    own = regression(signals, arm, base, "coulomb_viscous").A[:, :, base.rank :]
+    assert np.flatnonzero(~own.any(axis=(0, 1))).tolist() == [2, 3]
+
+
 def test_an_arm_at_rest_tells_gravity_only_and_says_so():
     arm = panda()
     q = np.repeat(configurations(arm, 30, seed=1), 80, axis=0)

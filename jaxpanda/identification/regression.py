@@ -21,7 +21,7 @@ from ..arm import Arm
 from ..errors import InputError
 from ..friction import columns
 from ..parameters import Base, base_parameters
-from ..signals import STILL, Signals
+from ..signals import Signals
 
 _CHUNK = 1024  # samples whose regressor is evaluated at once; bounds the memory
 _AT_ONCE = 2**26  # numbers of the rows of some joints at the full rate; 512 MiB of them
@@ -91,7 +91,7 @@ def moving(signals: Signals) -> Float[np.ndarray, "time dof"]:
     Noise of its encoder is no motion. Nor does friction brake a joint that trembles while others move: it yields
     by as much without sliding, and carries any load.
     """
-    return np.where(np.ptp(signals.q[signals.keep], axis=0) >= STILL, signals.qd, 0.0)
+    return np.where(signals.moves, signals.qd, 0.0)
 
 
 def with_columns(

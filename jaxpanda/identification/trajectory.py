@@ -17,7 +17,7 @@ from ..feasible import Bounds, Constraint
 from ..friction import LINEAR, MODELS, Friction, check_model
 from ..parameters import Base, arm_base_parameters
 from ..recordings import Recording
-from ..signals import STILL, Signals, blocks_many, prepare, repeatability
+from ..signals import Signals, blocks_many, prepare, repeatability
 from .condensed import Condensed, Evidence
 from .one_step import PRIOR, Prior, feasible_least_squares
 from .regression import Fit, Masks, Regression, everything, excited, least_squares, regression, triangle
@@ -131,7 +131,7 @@ def _check_alive(recordings: Sequence[Recording], signals: Sequence[Signals], fr
 
     At rest friction may carry any load; without any, one pose tells as much of gravity as it shows.
     """
-    moves = [np.ptp(s.q[s.keep], axis=0) >= STILL for s in signals]
+    moves = [s.moves for s in signals]
     for recording, moving in zip(recordings, moves, strict=True):
         constant = recording.tau is not None and np.ptp(recording.tau, axis=0) == 0
         if np.any(stuck := moving & constant):
