@@ -63,6 +63,11 @@ def least_beyond(
     return least
 
 
+def linear(model: str) -> tuple[str, ...]:
+    """The parameters that a model is linear in."""
+    return ("phi1",) if model == "sigmoid" else LINEAR[model]
+
+
 def check_model(model: str) -> None:
     """Refuse a name that is none of `MODELS`."""
     if model not in MODELS:

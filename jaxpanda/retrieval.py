@@ -25,8 +25,10 @@ from .feasible.solver import NOTHING, STARTS
 from .files import Kind, finite, output_folder, settle, write_json, write_npz
 from .friction import MODELS, Friction, least_beyond
 from .identification import Identification
-from .identification.condensed import Evidence, linear_names, own_parameters, with_own_parameters
+from .identification.condensed import Condensed, Evidence, linear_names, own_parameters, with_own_parameters
+from .identification.one_step import Prior
 from .identification.result import known_physics
+from .identification.statistics import samples_as_one
 from .inputs import read_json, read_npz
 from .model_file import WHOLE, Part
 from .panda import is_panda, panda
@@ -43,13 +45,9 @@ AS_GOOD = 1.01
 """A solution is as good as the best where its objective is within this factor of it."""
 CONCESSION = 5e-4
 """Share of the objective that may be given up to stay near the nominal parameters."""
-TORQUE_CONCESSION = 0.01
-"""Share by which the torque error may grow for the same, where recordings were identified. On motion that was
-not fitted that of the real Panda's links is lower for it: the model knows better what torque hardly tells."""
 ACTIVE = 1e-5
 """A constraint is active where its margin is below this share of its box (triangle inequality: [kg m²])."""
 _POINT = 1e-9
-_LEAST_SIZE = 0.01  # [m]: where a centre of mass is known
 _DOUBT = (
     1.05  # factor of the torque error, or of the objective's root, that the room for carried bodies may cost
 )
@@ -264,8 +262,8 @@ def retrieve(
         penalty: "smooth" is `feasible.solve`; "exact" is the paper's Algorithm 1, for comparison.
         prefer: "best", the lowest objective; "nominal", near to the nominal parameters (of `arm`) in all that
             the coefficients do not tell, at an objective no more than `CONCESSION` higher or, under "torque"
-            and where recordings were identified, a torque error about `TORQUE_CONCESSION` higher ("smooth"
-            penalty only).
+            and where recordings were identified, as the links that torque and `Prior.around` the nominal ones
+            together make likely ("smooth" penalty only).
         starts: random starts.
         seed: same seed, same answer.
         certificate: lower bound by convex optimisation; "auto" where the extra [sdp] is installed.
@@ -286,7 +284,11 @@ def retrieve(
         arm = None  # bounds of other links say nothing of this arm's
     if weighting == "auto":
         weighting = "torque" if table.method in ("trajectory", "one_step") else "none"
-    A, b = _equations(table, boxes.dof, weighting)
+    expected, as_one = None, 1.0
+    if table.evidence is not None:
+        as_one = _samples_as_one(table, table.evidence.whole)
+        expected = _with_expected_offsets(table, table.evidence, as_one)
+    A, b = _equations(table, expected, boxes.dof, weighting)
     constraints = tuple(constraints)
     carried = None if arm is None or arm.lumped is None else np.asarray(arm.lumped)
     smooth = partial(solve, carried=carried, devices=devices, checkpoint=checkpoint)
@@ -302,28 +304,29 @@ def retrieve(
     as_good = feasible & (found.objective <= max(AS_GOOD * best, NOTHING * float(b @ b)))
     as_good[found.best] = True
     phi, violation = found.phi[found.best], float(found.violation[found.best])
-    nominal = None if arm is None else np.asarray(arm.standard)
     notes = _notes(table, found, weighting)
     if table.model is None and table.arm == "panda" and bounds is None:
         notes.append("no model stands in the table: by its name it was taken for the Panda without hand")
-    if nominal is not None and feasible.any() and penalty == "smooth" and prefer == "nominal":
-        room = CONCESSION * best + NOTHING * float(b @ b)
-        if weighting == "torque" and table.evidence is not None and table.method == "trajectory":
-            room += _conceded(table.evidence.whole.dof * table.evidence.whole.samples + best)
-        pulled = _towards(nominal, A, b, boxes, constraints, carried, phi, room)
-        phi, violation = pulled, 0.0
-        if room > 2 * CONCESSION * best:
-            notes.append(
-                f"the torque error may be {100 * TORQUE_CONCESSION:g} % higher than it need be, for links"
-                " nearer to the model's"
-            )
+    prior = (
+        Prior.around(arm, boxes) if arm is not None and prefer == "nominal" and penalty == "smooth" else None
+    )
+    pull = partial(_pulled, bounds=boxes, constraints=constraints, carried=carried)
+    if prior is not None and feasible.any():
+        if weighting == "torque" and expected is not None and table.method == "trajectory":
+            likely = pull(A, b, prior, weight=as_one, initial=[phi, prior.phi])
+            phi = likely.phi[likely.best]
+        else:
+            phi = _towards(pull, A, b, prior, phi, CONCESSION * best + NOTHING * float(b @ b))
+        violation = 0.0
     if carried is not None and arm is not None and penalty == "smooth":
         known = 0.0  # squares that no links explain
         if weighting == "torque" and table.evidence is not None:
             known = float(table.evidence.whole.dof * table.evidence.whole.samples)
-        nothing = NOTHING * float(b @ b)
-        standard = np.asarray(arm.standard)
-        free = _pulled(standard, A, b, boxes, constraints, np.zeros_like(carried), phi, nothing)
+        nothing, standard = NOTHING * float(b @ b), Prior.around(arm, boxes)
+        weight = nothing / max(standard.distance(phi), np.finfo(float).tiny)
+        free = pull(
+            A, b, standard, weight=weight, initial=[phi, standard.phi], carried=np.zeros_like(carried)
+        )
         less = known + float(np.sum((A @ free.phi[free.best].ravel() - b) ** 2)) + nothing
         if known + best > _DOUBT**2 * less:
             notes.append(
@@ -331,8 +334,6 @@ def retrieve(
                 f" makes the error {100 * (np.sqrt((known + best) / less) - 1):.0f} % higher: does the recorded"
                 " arm carry those?"
             )
-    if prefer != "nominal" or penalty != "smooth":
-        nominal = None
     wanted = certificate is True or (
         certificate == "auto" and importlib.util.find_spec("clarabel") is not None
     )
@@ -340,12 +341,12 @@ def retrieve(
     names = table.link_names if len(table.link_names) == boxes.dof else ()
     names = names or tuple(f"link{i + 1}" for i in range(boxes.dof))
     friction, errors = table.friction, {}
-    if table.evidence is not None:
+    if table.evidence is not None and expected is not None:
         if weighting == "torque" and friction is not None:
-            own = table.evidence.whole.following(table.projection @ phi.ravel(), _least(table))
+            own = expected.whole.following(table.projection @ phi.ravel(), _least(table))
             friction = with_own_parameters(friction, own)
         errors = _torque_errors(
-            table, table.evidence, friction, boxes, constraints, carried, phi, weighting, nominal
+            table, table.evidence.whole, expected.folds, friction, pull, phi, weighting, prior, as_one
         )
     notes += _lost(table, errors.get("relative_error_percent"))
     return Retrieval(
@@ -484,7 +485,7 @@ def _bounds(bounds: Bounds | str | Path | None, arm: Arm | None, table: Identifi
 
 
 def _equations(
-    table: Identification, dof: int, weighting: str
+    table: Identification, expected: Evidence | None, dof: int, weighting: str
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " rows"]]:
     """Rows of the coefficients, weighed."""
     A, b = coefficient_matrix(table.terms, dof), table.beta
@@ -492,11 +493,10 @@ def _equations(
         if not table.reliable.any():
             raise InputError("coefficients: none is reliable, so there is nothing to retrieve from")
         return A[table.reliable], b[table.reliable]
-    if table.evidence is not None and table.method == "trajectory":
-        whole = table.evidence.whole  # a covariance of what is told next to what is not has too many digits
-        _, _, sigma = whole.classical(len(b), str(table.settings.get("weighting", "joint")))
-        T = whole.weigh(len(b), sigma)
-        return T @ A, T @ b
+    if expected is not None and table.method == "trajectory":
+        # a covariance of what is told next to what is not has too many digits
+        T, estimate, _, _ = _weighed(table, expected.whole)
+        return T @ A, T @ estimate
     covariance = table.classical_covariance
     if covariance is None:
         if table.std is None or not np.all((table.std > 0) & np.isfinite(table.std)):
@@ -509,110 +509,125 @@ def _equations(
     return root.T @ A, root.T @ b
 
 
+def _weighed(table: Identification, part: Condensed) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of a part of the recordings: the root of the coefficients' information, they themselves, friction, and the
+    residuals that weigh the joints."""
+    rank = len(table.beta)
+    estimate, own, sigma = part.classical(rank, str(table.settings.get("weighting", "joint")))
+    return part.weigh(rank, sigma), estimate, own, sigma
+
+
+def _samples_as_one(table: Identification, whole: Condensed) -> float:
+    """How many of the recordings' residuals tell as much as an independent one."""
+    if table.joint_covariance is None:
+        return 1.0
+    T, estimate, own, sigma = _weighed(table, whole)
+    left = whole.residual(estimate, own) / sigma
+    square = float(left @ left) / (whole.dof * whole.samples)
+    return samples_as_one(T, table.joint_covariance[: len(estimate), : len(estimate)], square)
+
+
+def _with_expected_offsets(table: Identification, evidence: Evidence, as_one: float) -> Evidence:
+    """The recordings where no offset of a torque sensor is expected to be larger than its joint's torque (rms).
+
+    Links are used where the sensors are not. A motion that hardly tells an offset from gravity would have links
+    take any torque that the offset then undoes, for the least bit of a better fit. What the recordings say
+    against the expectation counts by as many samples as are independent.
+    """
+    names, whole = linear_names(table.friction), evidence.whole
+    if "offset" not in names:
+        return evidence
+    _, estimate, own, _ = _weighed(table, whole)
+    torque = np.maximum(np.linalg.norm(whole.R[:, :, -1], axis=1), np.finfo(float).tiny)
+    weights = np.zeros((whole.dof, len(names)))
+    weights[:, names.index("offset")] = np.sqrt(as_one) * whole.residual(estimate, own) / torque
+    folds = tuple((train.expecting(weights), test) for train, test in evidence.folds)
+    return Evidence(whole.expecting(weights), folds)
+
+
 def _towards(
-    nominal: Float[np.ndarray, "dof 10"],
+    pull: Callable[..., Solutions],
     A: Float[np.ndarray, "rows columns"],
     b: Float[np.ndarray, " rows"],
-    bounds: Bounds,
-    constraints: tuple[Constraint, ...],
-    carried: Float[np.ndarray, "dof 10"] | None,
+    prior: Prior,
     best: Float[np.ndarray, "dof 10"],
     room: float,
 ) -> Float[np.ndarray, "dof 10"]:
     r"""Links nearer to the nominal ones that meet the coefficients as well as `best`, but for `room`.
 
-    Minimises $\lVert A\phi - b\rVert^2 + \epsilon R(\phi)$ from `best`, R the squared distance from nominal as
-    shares of a link's size. Its minimum has an objective of at most $\phi_{best} + \epsilon R(\phi_{best})$, and
+    Minimises $\lVert A\phi - b\rVert^2 + \epsilon R(\phi)$ from `best`, R the squared distance from nominal in
+    the prior's deviations. Its minimum has an objective of at most $\phi_{best} + \epsilon R(\phi_{best})$, and
     $\epsilon$ is what makes this `room` higher: only what the coefficients leave open moves.
     """
     objective = lambda phi: float(np.sum((A @ phi.ravel() - b) ** 2))
-    scale = _scale(nominal, bounds)
-    distance = lambda phi: float(np.sum(((phi - nominal) / scale) ** 2))
-    pulled = _pulled(nominal, A, b, bounds, constraints, carried, best, room)
+    weight = room / max(prior.distance(best), np.finfo(float).tiny)
+    pulled = pull(A, b, prior, weight=weight, initial=[best, prior.phi])
     nearer = (
         (pulled.violation == 0)
         & np.array([objective(phi) <= objective(best) + room for phi in pulled.phi])
-        & np.array([distance(phi) < distance(best) for phi in pulled.phi])
+        & np.array([prior.distance(phi) < prior.distance(best) for phi in pulled.phi])
     )
     return pulled.phi[np.argmin(np.where(nearer, pulled.objective, np.inf))] if nearer.any() else best
 
 
-def _conceded(squares: float) -> float:
-    """By how much squares may grow for their root to grow by `TORQUE_CONCESSION`."""
-    return 2 * TORQUE_CONCESSION * squares
-
-
-def _scale(nominal: Float[np.ndarray, "dof 10"], bounds: Bounds) -> Float[np.ndarray, "dof 10"]:
-    """In which distances from the nominal links count."""
-    mass = np.maximum(nominal[:, :1], 0.1 * nominal[:, 0].mean())
-    size = np.maximum(np.linalg.norm(np.diff(bounds.com)[..., 0], axis=-1), _LEAST_SIZE)[:, None]
-    return np.concatenate([mass, *[mass * size] * 3, *[mass * size**2] * 6], 1)
-
-
 def _pulled(
-    nominal: Float[np.ndarray, "dof 10"],
     A: Float[np.ndarray, "rows columns"],
     b: Float[np.ndarray, " rows"],
+    prior: Prior,
+    *,
+    weight: float,
+    initial: Sequence[Float[np.ndarray, "dof 10"]],
     bounds: Bounds,
     constraints: tuple[Constraint, ...],
     carried: Float[np.ndarray, "dof 10"] | None,
-    first: Float[np.ndarray, "dof 10"],
-    room: float,
 ) -> Solutions:
-    """From `first`, with a pull towards the nominal links that costs no more than `room` there."""
-    scale = _scale(nominal, bounds)
-    root = np.sqrt(room / max(float(np.sum(((first - nominal) / scale) ** 2)), 1e-300))
+    r"""$\min_\phi \lVert A\phi - b\rVert^2 + w\,R(\phi)$, R the squared distance from what the prior expects."""
+    root = np.sqrt(weight) / prior.std.ravel()
     return solve(
-        np.concatenate([A, np.diag(root / scale.ravel())]),
-        np.concatenate([b, root * (nominal / scale).ravel()]),
+        np.concatenate([A, np.diag(root)]),
+        np.concatenate([b, root * prior.phi.ravel()]),
         bounds,
         constraints=constraints,
         carried=carried,
-        initial=np.stack([first, nominal]),
-        starts=2,
+        initial=np.stack(initial),
+        starts=len(initial),
     )
 
 
 def _torque_errors(
     table: Identification,
-    evidence: Evidence,
+    whole: Condensed,
+    folds: Sequence[tuple[Condensed, Condensed]],
     friction: Friction | None,
-    bounds: Bounds,
-    constraints: tuple[Constraint, ...],
-    carried: Float[np.ndarray, "dof 10"] | None,
+    pull: Callable[..., Solutions],
     phi: Float[np.ndarray, "dof 10"],
     weighting: str,
-    nominal: Float[np.ndarray, "dof 10"] | None,
+    prior: Prior | None,
+    as_one: float,
 ) -> dict[str, Any]:
     """What links and friction leave of the torque, and what they do on blocks that they were found without.
 
     The latter for links found by the torque of recordings only: which coefficients are reliable is not known
     block by block, and what `one_step` expects of links is not known here.
     """
-    whole, K = evidence.whole, table.projection
+    K = table.projection
     beta = K @ phi.ravel()
     left = whole.residual(beta, own_parameters(friction, whole.dof))
     errors: dict[str, Any] = {
         "rmse": left / np.sqrt(whole.samples),
         "relative_error_percent": _percent(left, whole.torque),
     }
-    if weighting != "torque" or table.method != "trajectory" or not evidence.folds:
+    if weighting != "torque" or table.method != "trajectory" or not folds:
         return errors
     squares, least = np.zeros(whole.dof), _least(table)
-    for train, test in evidence.folds:
-        estimate, own, sigma = train.classical(len(beta), str(table.settings.get("weighting", "joint")))
-        T = train.weigh(len(beta), sigma)
-        A, b = T @ K, T @ estimate
-        nothing = NOTHING * float(b @ b)
-        found = _pulled(phi if nominal is None else nominal, A, b, bounds, constraints, carried, phi, nothing)
-        links = found.phi[found.best]
-        if nominal is not None:
-            left = train.residual(estimate, own) / sigma
-            room = _conceded(float(left @ left) + float(np.sum((A @ links.ravel() - b) ** 2)))
-            links = _towards(nominal, A, b, bounds, constraints, carried, links, room)
-        squares += test.residual(K @ links.ravel(), train.following(K @ links.ravel(), least)) ** 2
-    samples = sum(test.samples for _, test in evidence.folds)
-    torque = float(np.linalg.norm([test.torque for _, test in evidence.folds]))
+    prior = prior or Prior(phi, np.full_like(phi, np.inf))
+    for train, test in folds:
+        T, estimate, _, _ = _weighed(table, train)
+        found = pull(T @ K, T @ estimate, prior, weight=as_one, initial=[phi, prior.phi])
+        beta = K @ found.phi[found.best].ravel()
+        squares += test.residual(beta, train.following(beta, least)) ** 2
+    samples = sum(test.samples for _, test in folds)
+    torque = float(np.linalg.norm([test.torque for _, test in folds]))
     return errors | {
         "cross_validated_rmse": np.sqrt(squares / samples),
         "cross_validated_relative_error_percent": _percent(np.sqrt(squares), torque),

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from .. import inputs
 from ..errors import InputError
 from ..files import write_npz
-from ..friction import LINEAR, Friction
+from ..friction import Friction, linear
 from .regression import Masks, Regression, triangle, triangles, weighted_fit
 
 FILE = "identification.npz"
@@ -74,6 +74,14 @@ class Condensed:
             wide[j, :, -1] = R[:, -1]
         fit = weighted_fit(wide, self.samples, weighting)
         return fit.x[:rank], fit.x[rank:].reshape(dof, extra), fit.sigma
+
+    def expecting(self, weights: Float[np.ndarray, "dof extra"]) -> "Condensed":
+        """The same where friction's parameters are expected to be zero, off by weight times parameter [N m]."""
+        extra = weights.shape[1]
+        rows = np.zeros((self.dof, extra, self.R.shape[2]))
+        rows[:, :, -1 - extra : -1] = weights[:, :, None] * np.eye(extra)
+        R = np.stack([triangle(np.concatenate(pair)) for pair in zip(self.R, rows, strict=True)])
+        return dataclasses.replace(self, R=R)
 
     def weigh(self, rank: int, sigma: Float[np.ndarray, " dof"]) -> Float[np.ndarray, "base base"]:
         r"""$T$ with $\lVert T\,\delta\rVert^2$ the weighted squares that moving base parameters by δ costs.
@@ -159,9 +167,7 @@ def own_parameters(friction: Friction | None, dof: int) -> Float[np.ndarray, "do
 
 def linear_names(friction: Friction | None) -> tuple[str, ...]:
     """The parameters that friction is linear in."""
-    if friction is None:
-        return ()
-    return ("phi1",) if friction.model == "sigmoid" else LINEAR[friction.model]
+    return () if friction is None else linear(friction.model)
 
 
 def with_own_parameters(friction: Friction, own: Float[np.ndarray, "dof extra"]) -> Friction:

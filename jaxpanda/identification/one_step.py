@@ -1,14 +1,16 @@
 r"""Link parameters that could be built, straight from torque.
 
 $$\min_{\phi, \theta}\;
-  \frac{N_e}{N} \sum_j \frac{\lVert y_j - W_j K\phi - \Psi_j\theta_j\rVert^2}{\sigma_j^2}
-  + \sum_k \frac{(\phi_k - \phi_{0k})^2}{s_k^2} \quad
+  \frac{1}{c} \sum_j \frac{\lVert y_j - W_j K\phi - \Psi_j\theta_j\rVert^2}{\sigma_j^2}
+  + \sum_k \frac{(\phi_k - \phi_{0k})^2}{s_k^2} + \sum_j \frac{b_j^2}{\tau_j^2} \quad
   \text{over feasible } \phi \text{ and friction that takes energy out}$$
 
 Feasibility is a regulariser: it forbids what no robot could have, so that the fit in sample is worse and the
 fit on held-out motion better. Torque leaves 27 of the Panda's 70 parameters open and others nearly so; for
-those the second term says that links are as the arm's model has them, give or take `prior` times as much. The
-$N$ residuals count as $N_e$ independent ones, two a period of the cutoff: both terms are in one unit.
+those the second term says that links are as the arm's model has them, give or take `prior` times as much. Nor is
+an offset $b_j$ of a torque sensor expected to be larger than its joint's torque $\tau_j$ (rms), lest links and
+offsets that undo each other be found. $c$ correlated residuals tell as much as an independent one
+(`statistics.samples_as_one`): all terms are in one unit.
 """
 
 import dataclasses
@@ -19,9 +21,10 @@ from jaxtyping import Float
 
 from ..arm import Arm
 from ..feasible import Bounds, Constraint, Solutions, solve
-from ..friction import MODELS, least_beyond
+from ..friction import least_beyond, linear
 from ..parameters import Base
 from .regression import Fit, Masks, Regression, least_squares, triangle, triangles
+from .statistics import covariances, samples_as_one
 
 PRIOR = 1.0
 """Default width of the expectation around nominal links, as a share of them."""
@@ -48,6 +51,10 @@ class Prior:
         carried = None if arm.lumped is None else np.asarray(arm.lumped)
         return cls(phi, np.where(std > 0, std, np.inf), carried)
 
+    def distance(self, phi: Float[np.ndarray, "dof 10"]) -> float:
+        """Squared, from what is expected, in its deviations."""
+        return float(np.sum(((phi - self.phi) / self.std) ** 2))
+
 
 def feasible_least_squares(
     regressions: Sequence[Regression],
@@ -58,7 +65,6 @@ def feasible_least_squares(
     bounds: Bounds,
     prior: Prior,
     *,
-    cutoff: float,
     known: Mapping[str, Float[np.ndarray, " dof"]],
     constraints: Sequence[Constraint] = (),
     starts: int,
@@ -74,17 +80,17 @@ def feasible_least_squares(
         friction: the model behind the friction's columns.
         bounds: boxes on the links' parameters.
         prior: what links are expected to be; the first start as well.
-        cutoff: of the low-pass behind the regressions [Hz].
         known: what the model holds beyond rigid links, by name.
         constraints: further ones, as functions of `Links`.
         starts: of the solver.
         seed: same seed, same answer.
     """
-    sigma = least_squares(regressions, masks, weighting).sigma
+    fit = least_squares(regressions, masks, weighting)
+    sigma = fit.sigma
     if weighting == "none":  # one unit for all joints, which the prior needs
-        rows = triangles(regressions, masks) @ np.append(-least_squares(regressions, masks, weighting).x, 1.0)
+        rows = triangles(regressions, masks) @ np.append(-fit.x, 1.0)
         sigma = sigma * np.linalg.norm(rows) / np.sqrt(len(sigma) * sum(int(m.sum()) for m in masks))
-    A, b = problem(regressions, masks, sigma, base, prior, cutoff)
+    A, b = problem(regressions, masks, dataclasses.replace(fit, sigma=sigma), base, prior, friction)
     low, high = friction_bounds(friction, len(sigma), known)
     found = solve(
         A,
@@ -105,28 +111,44 @@ def feasible_least_squares(
 def problem(
     regressions: Sequence[Regression],
     masks: Masks,
-    sigma: Float[np.ndarray, " dof"],
+    fit: Fit,
     base: Base,
     prior: Prior,
-    cutoff: float,
+    friction: str,
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " rows"]]:
-    r"""The whole objective as $\lVert A(\phi, \theta) - b\rVert^2$, less what no parameter can explain."""
-    duration = sum(r.duration * mask.mean() for r, mask in zip(regressions, masks, strict=True))
-    samples = sum(int(mask.sum()) for mask in masks)
-    weight = np.sqrt(min(1.0, 2 * cutoff * duration / samples))
-    rows = np.concatenate(triangles(regressions, masks) / sigma[:, None, None]) * weight
-    R = triangle(rows)[:-1]
+    r"""The whole objective as $\lVert A(\phi, \theta) - b\rVert^2$, less what no parameter can explain.
+
+    `fit` is the classical one.
+    """
+    R = triangle(np.concatenate(triangles(regressions, masks) / fit.sigma[:, None, None]))[:-1]
+    R = R / np.sqrt(_correlation(regressions, masks, fit, R[:, :-1]))
     rank, extra = base.rank, R.shape[1] - 1 - base.rank
     data = np.concatenate([R[:, :rank] @ base.projection, R[:, rank : rank + extra]], axis=1)
-    expected = np.diag(1 / prior.std.ravel())
-    A = np.concatenate([data, np.pad(expected, ((0, 0), (0, extra)))])
-    return A, np.concatenate([R[:, -1], (prior.phi / prior.std).ravel()])
+    torque = np.sqrt(
+        np.mean(np.concatenate([r.y[:, m] ** 2 for r, m in zip(regressions, masks, strict=True)], 1), 1)
+    )
+    own = np.array([[name == "offset" for name in linear(friction)]] * len(torque), float)
+    own /= np.maximum(torque, np.finfo(float).tiny)[:, None]
+    A = np.concatenate([data, np.diag(np.concatenate([1 / prior.std.ravel(), own.ravel()]))])
+    return A, np.concatenate([R[:, -1], (prior.phi / prior.std).ravel(), np.zeros(extra)])
+
+
+def _correlation(
+    regressions: Sequence[Regression], masks: Masks, fit: Fit, T: Float[np.ndarray, "n n"]
+) -> float:
+    """How many of the residuals that the classical fit leaves tell as much as an independent one."""
+    left = [
+        dataclasses.replace(r, A=r.A[:, m], y=r.y[:, m], tau=r.tau[:, m])
+        for r, m in zip(regressions, masks, strict=True)
+        if m.any()
+    ]
+    e = np.concatenate([r.residual(fit.x) for r in left], 1) / fit.sigma[:, None]
+    return samples_as_one(T, covariances(left, fit.x, fit.sigma)[2], float(np.mean(e**2)))
 
 
 def friction_bounds(
     friction: str, dof: int, known: Mapping[str, Float[np.ndarray, " dof"]]
 ) -> tuple[Float[np.ndarray, " parameters"], Float[np.ndarray, " parameters"]]:
     """Bounds of the friction's linear parameters beyond what the model holds, in their columns' order."""
-    linear = ("phi1",) if friction == "sigmoid" else MODELS[friction]
-    lower = least_beyond(linear, known, dof).ravel()
+    lower = least_beyond(linear(friction), known, dof).ravel()
     return lower, np.full(len(lower), np.inf)

@@ -117,6 +117,27 @@ def shrunk(
     return back @ ((1 - rho) * S + rho * mean * np.eye(n)) @ back.T + _UNTOLD * untold @ untold.T
 
 
+def samples_as_one(
+    T: Float[np.ndarray, "n n"], covariance: Float[np.ndarray, "n n"], square: float = 1.0
+) -> float:
+    r"""How many samples of correlated residuals tell as much as an independent one.
+
+    The mean, over the directions that $T^\top T$ tells of, of the variance of an estimate over the textbook's.
+
+    Args:
+        T: a root of the information of independent samples, as weighted.
+        covariance: of the estimate, robust.
+        square: mean square of a weighted residual.
+    """
+    scale = np.linalg.norm(T, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    _, s, directions = np.linalg.svd(T / scale)
+    told = s > np.sqrt(_TOLD) * s[0]
+    moved = s[told, None] * directions[told] * scale
+    variance = float(np.mean(np.einsum("ia,ab,ib->i", moved, covariance, moved)))
+    return max(1.0, variance / max(square, np.finfo(float).tiny))
+
+
 def _moves(
     H: Float[np.ndarray, "n n"],
     informations: Sequence[Float[np.ndarray, "n n"]],

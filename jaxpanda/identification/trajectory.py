@@ -94,7 +94,7 @@ def identify(
         if not prior > 0:
             raise InputError(f"prior: {prior!r} is no positive share of the nominal parameters")
         expected = Prior.around(arm, bounds, prior)
-        options = {"bounds": bounds, "prior": expected, "cutoff": cutoff, "known": of_model(arm)}
+        options = {"bounds": bounds, "prior": expected, "known": of_model(arm)}
         solver = partial(_feasible, problem, constraints=constraints, starts=starts, seed=seed, **options)
     else:
         solver = partial(_classical, problem)
