@@ -70,8 +70,8 @@ def test_the_scan_gives_each_shape_the_evidence_that_it_has_alone(problem: Probl
     terms = (problem.term(coulomb, np.array([0.3])),)
     noise = dataclasses.replace(problem.noise(terms), slow=slow)
     design = problem.design(terms, noise)
-    scanned = problem.scan(design, noise)
     groups = {(g.name, g.joint): g for g in (*problem.library, *problem.catchalls)}
+    scanned = problem.scan(design, noise, list(groups.values()))
     for place in (("stribeck_friction", 3), ("torque_drift", 0), ("unknown", 3), ("encoder_offset", None)):
         group = groups[place]
         value, scale, deviation = _score(problem, design, noise, group.effects, group.columns)

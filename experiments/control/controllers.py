@@ -89,12 +89,16 @@ def tuned(corrected, motion, tau, dt, first, disturbance, torque_scale, knots=3,
             schedule
         )
 
-    schedule, m, v, history = jnp.zeros((knots, 2 * dof)), 0.0, 0.0, []
-    for k in range(1, iterations + 1):  # Adam
+    schedule, m, v, rate, history, best = jnp.zeros((knots, 2 * dof)), 0.0, 0.0, 0.1, [], None
+    for k in range(1, iterations + 1):  # Adam; gains that let a roll-out run away are gone back from
         value, g = cost(schedule)
         if not (jnp.isfinite(value) and jnp.isfinite(g).all()):
-            raise FloatingPointError("a roll-out ran away: start from stiffer gains or weaker disturbances")
-        history.append(float(value))
+            if best is None:
+                raise FloatingPointError("a roll-out ran away: start from other gains or weaker disturbances")
+            (_, schedule, g), rate, m, v = best, rate / 4, 0.0, 0.0
+        else:
+            history.append(float(value))
+            best = min(best or (value, schedule, g), (value, schedule, g), key=lambda found: found[0])
         m, v = 0.9 * m + 0.1 * g, 0.99 * v + 0.01 * g**2
-        schedule = schedule - 0.1 * (m / (1 - 0.9**k)) / (jnp.sqrt(v / (1 - 0.99**k)) + 1e-9)
-    return gains(schedule), history
+        schedule = schedule - rate * (m / (1 - 0.9**k)) / (jnp.sqrt(v / (1 - 0.99**k)) + 1e-9)
+    return gains(best[1]), history

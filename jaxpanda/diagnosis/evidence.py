@@ -14,6 +14,7 @@ forward regression, and Bayesian model selection.
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -128,22 +129,49 @@ def levelled(
     return scipy.signal.lfilter([1.0, -pole], [1.0, -zero], y, axis=0, zi=past)
 
 
-class OnDemand(Sequence):
-    """Arrays that are made when they are asked for."""
+class Columns(Sequence):
+    """For each joint the columns of everything in a model. Most are zero: only those that act are kept."""
 
-    def __init__(self, make: Callable[[int], np.ndarray], count: int):
-        self.make, self.length = functools.cache(make), count
+    def __init__(
+        self, parts: Sequence[Sequence[tuple[slice, Float[np.ndarray, "rows _n"]]]], rows: int, width: int
+    ):
+        """`parts`: of each joint, what acts there, and which columns that is of so many."""
+        self.parts, self.rows, self.width = parts, rows, width
 
     def __len__(self) -> int:
-        return self.length
+        return len(self.parts)
 
-    def __getitem__(self, index: Any) -> Any:
-        if not 0 <= index < self.length:
-            raise IndexError(index)
-        return self.make(int(index))
+    def __getitem__(self, joint: Any) -> Any:
+        if not 0 <= joint < len(self):
+            raise IndexError(joint)
+        if joint not in self._whole:
+            A = np.zeros((self.rows, self.width))
+            for at, x in self.parts[joint]:
+                A[:, at] = x
+            self._whole[joint] = A
+        return self._whole[joint]
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return list, (list(self),)
+    @functools.cached_property
+    def _whole(self) -> dict[int, Float[np.ndarray, "rows n"]]:
+        return {}
+
+    def times(self, joint: int, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " rows"]:
+        """$A_j x$."""
+        return sum((part @ x[at] for at, part in self.parts[joint]), np.zeros(self.rows))
+
+    def products(self, joint: int, F: Float[np.ndarray, "rows m"]) -> Float[np.ndarray, "n m"]:
+        """$A_j^\\top F$."""
+        out = np.zeros((self.width, F.shape[1]))
+        for at, part in self.parts[joint]:
+            out[at] = part.T @ F
+        return out
+
+    def without(self, gone: slice) -> "Columns":
+        """Less the columns of one term."""
+        width = gone.stop - gone.start
+        moved = lambda at: at if at.start < gone.start else slice(at.start - width, at.stop - width)
+        kept = [[(moved(at), x) for at, x in here if at.start != gone.start] for here in self.parts]
+        return Columns(kept, self.rows, self.width - width)
 
 
 class Design:
@@ -158,6 +186,12 @@ class Design:
         terms: Sequence[Any] = (),
     ):
         """`normal` holds $A^\\top A$ and $A^\\top r$ where they are known; `terms` made the last columns."""
+        if not isinstance(columns, Columns):
+            ends = len(precision) - np.cumsum([0, *(t.width for t in reversed(terms))])[::-1]
+            each = [slice(int(a), int(b)) for a, b in itertools.pairwise([0, *ends])]
+            columns = Columns(
+                [[(at, A[:, at]) for at in each] for A in columns], len(residual[0]), len(precision)
+            )
         self.columns, self.residual, self.precision, self.terms = columns, residual, precision, tuple(terms)
         if normal is None:
             pairs = list(zip(columns, residual, strict=True))
@@ -188,17 +222,16 @@ class Design:
     def without(self, i: int) -> "Design":
         """The model less one of its terms."""
         first = len(self.precision) - sum(t.width for t in self.terms[i:])
-        kept = np.ones(len(self.precision), bool)
-        kept[first : first + self.terms[i].width] = False
+        gone, kept = slice(first, first + self.terms[i].width), np.ones(len(self.precision), bool)
+        kept[gone] = False
         normal = self.normal[0][np.ix_(kept, kept)], self.normal[1][kept]
-        columns = OnDemand(lambda joint: self.columns[joint][:, kept], len(self.columns))
         others = (*self.terms[:i], *self.terms[i + 1 :])
-        return Design(columns, self.residual, self.precision[kept], normal, others)
+        return Design(self.columns.without(gone), self.residual, self.precision[kept], normal, others)
 
     @functools.cached_property
     def left(self) -> list[Float[np.ndarray, " rows"]]:
         """What the model leaves of each joint's residual."""
-        return [r - A @ self.x for r, A in zip(self.residual, self.columns, strict=True)]
+        return [r - self.columns.times(j, self.x) for j, r in enumerate(self.residual)]
 
     def solve(self, y: np.ndarray) -> np.ndarray:
         """$H^{-1} y$."""
@@ -225,7 +258,7 @@ class Design:
         flat = Phi.reshape(rows, m * n)
         b = (flat.T @ self.left[joint]).reshape(m, n)
         if self.factor is not None:
-            C = scipy.linalg.solve_triangular(self.factor[0], self.columns[joint].T @ flat, lower=True)
+            C = scipy.linalg.solve_triangular(self.factor[0], self.columns.products(joint, flat), lower=True)
             G = G - gram(C.reshape(-1, m, n))
         return b, G
 
@@ -235,13 +268,13 @@ class Design:
         """b and G of m candidates that act in all joints, given their Gram matrices in each."""
         _, m, n = Phi[0].shape
         b, G, C = np.zeros((m, n)), np.zeros((m, n, n)), np.zeros((len(self.g), m * n))
-        for A, left, F, Q in zip(self.columns, self.left, Phi, grams, strict=True):
+        for joint, (left, F, Q) in enumerate(zip(self.left, Phi, grams, strict=True)):
             if not Q.any():
                 continue
             flat = F.reshape(len(F), m * n)
             b += (flat.T @ left).reshape(m, n)
             G += Q
-            C += A.T @ flat
+            C += self.columns.products(joint, flat)
         if self.factor is not None:
             C = scipy.linalg.solve_triangular(self.factor[0], C, lower=True)
             G = G - gram(C.reshape(-1, m, n))

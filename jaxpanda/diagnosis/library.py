@@ -1,6 +1,7 @@
 """Every shape of every effect as columns on the coarse grid of each recording."""
 
 import dataclasses
+import functools
 from collections import defaultdict
 from collections.abc import Sequence
 
@@ -31,6 +32,11 @@ class Candidates:
     @property
     def name(self) -> str:
         return self.effects[0].name
+
+    @functools.cached_property
+    def form_priors(self) -> Float[np.ndarray, " m"]:
+        """Odds of each shape's form, as logarithms."""
+        return np.array([e.form_prior for e in self.effects])
 
 
 def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndarray, "_time ..."]:

@@ -212,7 +212,7 @@ def _yule_walker(gamma: Float[np.ndarray, " lags"]) -> tuple[Float[np.ndarray, "
 
 def whitened_residual(problem: Problem, design: Design, joint: int) -> list[Float[np.ndarray, " _time"]]:
     """What a model leaves in a joint of each recording, in deviations of its innovations."""
-    left = design.residual[joint] - design.columns[joint] @ design.x
+    left = design.left[joint]
     return np.split(left, np.cumsum([t.motion.samples for t in problem.traces])[:-1])
 
 

@@ -5,6 +5,7 @@ import functools
 import itertools
 import operator
 import threading
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,7 +20,7 @@ from ..errors import InputError
 from . import catchall
 from .bodies import Body, body
 from .discrepancy import at_rest, of_law, unresolved, unresolved_known
-from .evidence import Design, Noise, OnDemand
+from .evidence import Columns, Design, Noise
 from .host import parallel
 from .library import Candidates, build, columns_of
 from .noise import ORDER, QUIETEST, Saturation
@@ -240,17 +241,18 @@ class Problem:
             fresh = {key_of(effect): [c[..., i, :] for c in columns] for i, effect in enumerate(new)}
             known.update(fresh)
             with self._lock:
-                if sum(c.nbytes for kept in self._later.values() for c in kept) > _MEMORY:
+                if sum(self._later.values()) > _MEMORY:
                     for key in self._later:
                         del self._evaluated[key]
                     self._later.clear()
-                self._later.update(fresh)
+                self._later.update({key: sum(c.nbytes for c in kept) for key, kept in fresh.items()})
                 self._evaluated.update(fresh)
         each = [known[key_of(e)] for e in effects]
         return [np.stack([c[r] for c in each], -2) for r in range(len(self.traces))]
 
     @functools.cached_property
-    def _later(self) -> dict[tuple, list[np.ndarray]]:
+    def _later(self) -> dict[tuple, int]:
+        """Which of these are no shapes of the grids, and their bytes."""
         return {}
 
     def placed(self, effects: Sequence[AbstractEffect], r: int) -> list[AbstractEffect]:
@@ -285,6 +287,13 @@ class Problem:
         return families([*self.library, *self.catchalls], self.dof)
 
     @functools.cached_property
+    def places(self) -> Counter[str]:
+        """At how many places each effect is tried."""
+        keys = {(g.name, g.effects[0].joints) for g in (*self.library, *self.catchalls)}
+        events = {(name, (j,)) for name in ("torque_ripple", "external_contact") for j in range(self.dof)}
+        return Counter(name for name, _ in {*keys, *events, ("payload_change", ())})
+
+    @functools.cached_property
     def likeliest_shapes(self) -> dict[tuple, AbstractEffect]:
         """Where searches over the shapes of an effect at a place have ended last."""
         return {}
@@ -298,11 +307,13 @@ class Problem:
     def _scanned(self) -> list:
         return []
 
-    def scan(self, design: Design, noise: Noise) -> dict[int, Score]:
-        """`scan.scan`; that of the last design is kept."""
+    def scan(self, design: Design, noise: Noise, groups: Sequence[Candidates]) -> dict[int, Score]:
+        """`scan.scan` of these groups' families; those of the last design are kept."""
         if not self._scanned or self._scanned[0] is not design or self._scanned[1] is not noise:
-            self._scanned[:] = design, noise, scan(self, design, noise)
-        return self._scanned[2]
+            self._scanned[:] = design, noise, {}
+        found, asked = self._scanned[2], {id(g) for g in groups} - set(self._scanned[2])
+        found |= scan(self, design, noise, [f for f in self.families if asked & {id(g) for g in f.groups}])
+        return found
 
     @functools.cached_property
     def _joints(self) -> dict[tuple[int, bool], Whitened]:
@@ -384,14 +395,7 @@ class Problem:
             g += A.T @ residual
         precision = np.concatenate([np.ones(counts[0]), *(t.precision for t in terms)])
         parts = [[(at, x) for key, at in place.items() if (x := h.rows(key)) is not None] for h in joints]
-
-        def joined(joint: int) -> Float[np.ndarray, "rows n"]:
-            A = np.zeros((len(joints[joint].residual), int(ends[-1])))
-            for at, x in parts[joint]:
-                A[:, at] = x
-            return A
-
-        columns = OnDemand(joined, self.dof)
+        columns = Columns(parts, len(joints[0].residual), int(ends[-1]))
         return Design(columns, [h.residual for h in joints], precision, (H, g), terms)
 
     @functools.cached_property

@@ -54,7 +54,7 @@ def ranked(
         kept += events
     elif len(where) > 1 or joints is None or before:
         scanned += [_weighed(problem, design, noise, p) for p in windows(problem, design, noise)]
-    many = _places(problem)
+    many = problem.places
     held = Counter(t.effect.name for t in design.terms)
     best: dict[tuple, Proposal] = {}
     for p in scanned:
@@ -92,7 +92,7 @@ def by_place(proposals: Sequence[Proposal]) -> dict[int | None, list[Proposal]]:
 
 def plainer(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> list[Proposal]:
     """A proposal in its plainer forms, which have no shape to be searched for."""
-    out, places = [], _places(problem)
+    out, places = [], problem.places
     for effect in proposal.effect.plainer:
         best, deviation = evidence_of(problem, design, noise, effect)
         out.append(with_prior(Proposal(effect, best, best, deviation, ()), places[effect.name]))
@@ -110,21 +110,13 @@ def is_elsewhere(effect: AbstractEffect, joints: Collection[int]) -> bool:
     return isinstance(effect, AbstractJointEffect) and effect.joints[0] not in joints
 
 
-def _places(problem: Problem) -> Counter[str]:
-    """At how many places each effect is tried."""
-    keys = {(g.name, g.effects[0].joints) for g in (*problem.library, *problem.catchalls)}
-    events = {(name, (j,)) for name in ("torque_ripple", "external_contact") for j in range(problem.dof)}
-    return Counter(name for name, _ in {*keys, *events, ("payload_change", ())})
-
-
 def grids(problem: Problem, design: Design, noise: Noise, groups: Sequence[Candidates]) -> list[Proposal]:
     """For each effect and place in a library, the likeliest shape and the evidence over all."""
     scores: dict[tuple, list] = defaultdict(list)
-    scanned = problem.scan(design, noise)
+    scanned = problem.scan(design, noise, groups)
     for group in groups:
         score, deviation = scanned[id(group)]
-        prior = np.array([e.form_prior for e in group.effects])
-        scores[group.name, group.effects[0].joints].append((group, score + prior, deviation))
+        scores[group.name, group.effects[0].joints].append((group, score + group.form_priors, deviation))
     out = []
     for parts in scores.values():
         everything = np.concatenate([score for _, score, _ in parts])

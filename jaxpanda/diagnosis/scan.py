@@ -216,15 +216,15 @@ Score = tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]
 """Log Bayes factor of each shape of a group, and the prior deviations at its likeliest scale."""
 
 
-def scan(problem: "Problem", design: Design, noise: Noise) -> dict[int, Score]:
-    """Scores of all groups of the library and of the free forms, by the group's identity."""
+def scan(problem: "Problem", design: Design, noise: Noise, families: Sequence[Family]) -> dict[int, Score]:
+    """Scores of all groups of these families, by the group's identity."""
 
     def one(family: Family):
         return family, *projected(problem, noise, design, family.blocks), family.deviation(noise)
 
     problem.whitened_joints(noise, design.terms)
     alike: dict[tuple, list] = defaultdict(list)
-    for part in parallel(one, problem.families):
+    for part in parallel(one, families):
         alike[part[0].scales, part[1].shape[1]].append(part)
     out = {}
     for (scales, _), parts in alike.items():
