@@ -112,12 +112,12 @@ def _barrier(
     value, gradient, hessian = 0.5 * float(z @ z), z.copy(), np.eye(len(z))
     for constant, steps in blocks:
         try:
-            factor = np.linalg.cholesky(constant + np.tensordot(z, steps, 1))
+            factor = np.linalg.cholesky(constant + (z @ steps.reshape(len(z), 16)).reshape(4, 4))
         except np.linalg.LinAlgError:
             return np.inf, gradient, hessian
         value -= 2 * price * float(np.log(np.diag(factor)).sum())
         if derivatives:
-            inverse = scipy.linalg.solve_triangular(factor, np.eye(4), lower=True)
+            inverse = np.linalg.inv(factor)
             level = (inverse @ steps @ inverse.T).reshape(len(z), 16)
             gradient = gradient - price * level[:, ::5].sum(1)
             hessian = hessian + price * level @ level.T

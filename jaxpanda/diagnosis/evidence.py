@@ -258,7 +258,8 @@ class Design:
         flat = Phi.reshape(rows, m * n)
         b = (flat.T @ self.left[joint]).reshape(m, n)
         if self.factor is not None:
-            C = scipy.linalg.solve_triangular(self.factor[0], self.columns.products(joint, flat), lower=True)
+            C = self.columns.products(joint, flat)
+            C = scipy.linalg.solve_triangular(self.factor[0], C, lower=True, check_finite=False)
             G = G - gram(C.reshape(-1, m, n))
         return b, G
 
@@ -276,7 +277,7 @@ class Design:
             G += Q
             C += self.columns.products(joint, flat)
         if self.factor is not None:
-            C = scipy.linalg.solve_triangular(self.factor[0], C, lower=True)
+            C = scipy.linalg.solve_triangular(self.factor[0], C, lower=True, check_finite=False)
             G = G - gram(C.reshape(-1, m, n))
         return b, G
 
