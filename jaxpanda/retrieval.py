@@ -307,14 +307,15 @@ def retrieve(
     notes = _notes(table, found, weighting)
     if table.model is None and table.arm == "panda" and bounds is None:
         notes.append("no model stands in the table: by its name it was taken for the Panda without hand")
-    prior = (
-        Prior.around(arm, boxes) if arm is not None and prefer == "nominal" and penalty == "smooth" else None
-    )
+    prior = None
+    if arm is not None and prefer == "nominal" and penalty == "smooth":
+        prior = Prior.around(arm, boxes)
     pull = partial(_pulled, bounds=boxes, constraints=constraints, carried=carried)
     if prior is not None and feasible.any():
         if weighting == "torque" and expected is not None and table.method == "trajectory":
             likely = pull(A, b, prior, weight=as_one, initial=[phi, prior.phi])
-            phi = likely.phi[likely.best]
+            if likely.violation[likely.best] == 0:
+                phi = likely.phi[likely.best]
         else:
             phi = _towards(pull, A, b, prior, phi, CONCESSION * best + NOTHING * float(b @ b))
         violation = 0.0

@@ -370,7 +370,7 @@ def test_robust_intervals_hold_the_truth_where_noise_is_coloured_and_shared():
         own, common = random.normal(size=(3, 3000)), random.normal(size=3000)
         noise = scipy.signal.sosfilt(lowpass, own + 0.5 * common)[:, 1000:]
         y = A @ x + sigma[:, None] * noise / noise.std()
-        problem = [Regression("noise", A, y, y, 20.0)]
+        problem = [Regression("noise", A, y, y)]
         fit = least_squares(problem, everything(problem), "joint")
         for name, covariance in zip(held, covariances(problem, fit.x, fit.sigma), strict=True):
             held[name].append(np.abs(fit.x - x) < 1.96 * np.sqrt(np.diag(covariance)))
@@ -383,7 +383,7 @@ def test_on_white_noise_both_error_bars_agree():
     random = np.random.default_rng(1)
     A, x = random.normal(size=(3, 4000, 8)), random.normal(size=8)
     y = A @ x + random.normal(size=(3, 4000))
-    problem = [Regression("white", A, y, y, 40.0)]
+    problem = [Regression("white", A, y, y)]
     fit = least_squares(problem, everything(problem), "joint")
     robust, textbook = (np.sqrt(np.diag(C)) for C in covariances(problem, fit.x, fit.sigma)[:2])
     assert np.allclose(textbook, 1 / np.sqrt(12000), rtol=0.1)
@@ -400,7 +400,7 @@ def test_correlated_samples_count_by_the_noise_that_they_share():
         e = random.normal(size=(3, 6000))
         for noise in (e, scipy.signal.lfilter([1], [1, -0.8], e)):
             y = 100 * (A.sum(-1) + noise)
-            problem = [Regression("noise", A, y, y, 60.0)]
+            problem = [Regression("noise", A, y, y)]
             fit = least_squares(problem, everything(problem), "joint")
             T = triangle(np.concatenate(triangles(problem, everything(problem))[:, :, :-1] / fit.sigma[0]))
             counted.append(samples_as_one(T, covariances(problem, fit.x, fit.sigma)[2]))

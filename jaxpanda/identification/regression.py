@@ -45,8 +45,6 @@ class Regression:
     """Measured torque less what the arm's model holds beyond rigid links [N m]."""
     tau: Float[np.ndarray, "dof time"]
     """Measured torque [N m]: what relative errors are relative to."""
-    duration: float
-    """[s]"""
 
     def residual(self, x: Float[np.ndarray, " columns"]) -> Float[np.ndarray, "dof time"]:
         """What the unknowns `x` leave of the torque [N m]."""
@@ -82,7 +80,7 @@ def regression(signals: Signals, arm: Arm, base: Base, friction: str) -> Regress
             raise InputError(
                 f"{signals.name}: the filtered {what} is not finite; jaxpanda inspect shows where"
             )
-    return Regression(signals.name, A, tau - known, tau, len(signals.keep) / signals.output_rate)
+    return Regression(signals.name, A, tau - known, tau)
 
 
 def moving(signals: Signals) -> Float[np.ndarray, "time dof"]:
