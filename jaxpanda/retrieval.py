@@ -286,8 +286,7 @@ def retrieve(
         weighting = "torque" if table.method in ("trajectory", "one_step") else "none"
     expected, as_one = None, 1.0
     if table.evidence is not None:
-        as_one = _samples_as_one(table, table.evidence.whole)
-        expected = _with_expected_offsets(table, table.evidence, as_one)
+        expected, as_one = _with_expected_offsets(table, table.evidence)
     A, b = _equations(table, expected, boxes.dof, weighting)
     constraints = tuple(constraints)
     carried = None if arm is None or arm.lumped is None else np.asarray(arm.lumped)
@@ -518,32 +517,28 @@ def _weighed(table: Identification, part: Condensed) -> tuple[np.ndarray, np.nda
     return part.weigh(rank, sigma), estimate, own, sigma
 
 
-def _samples_as_one(table: Identification, whole: Condensed) -> float:
-    """How many of the recordings' residuals tell as much as an independent one."""
-    if table.joint_covariance is None:
-        return 1.0
-    T, estimate, own, sigma = _weighed(table, whole)
-    left = whole.residual(estimate, own) / sigma
-    square = float(left @ left) / (whole.dof * whole.samples)
-    return samples_as_one(T, table.joint_covariance[: len(estimate), : len(estimate)], square)
-
-
-def _with_expected_offsets(table: Identification, evidence: Evidence, as_one: float) -> Evidence:
+def _with_expected_offsets(table: Identification, evidence: Evidence) -> tuple[Evidence, float]:
     """The recordings where no offset of a torque sensor is expected to be larger than its joint's torque (rms).
+
+    And how many of their residuals tell as much as an independent one.
 
     Links are used where the sensors are not. A motion that hardly tells an offset from gravity would have links
     take any torque that the offset then undoes, for the least bit of a better fit. What the recordings say
     against the expectation counts by as many samples as are independent.
     """
-    names, whole = linear_names(table.friction), evidence.whole
+    names, whole, as_one = linear_names(table.friction), evidence.whole, 1.0
+    T, estimate, own, sigma = _weighed(table, whole)
+    left = whole.residual(estimate, own)
+    if table.joint_covariance is not None:
+        square = float(np.sum((left / sigma) ** 2)) / (whole.dof * whole.samples)
+        as_one = samples_as_one(T, table.joint_covariance[: len(T), : len(T)], square)
     if "offset" not in names:
-        return evidence
-    _, estimate, own, _ = _weighed(table, whole)
+        return evidence, as_one
     torque = np.maximum(np.linalg.norm(whole.R[:, :, -1], axis=1), np.finfo(float).tiny)
     weights = np.zeros((whole.dof, len(names)))
-    weights[:, names.index("offset")] = np.sqrt(as_one) * whole.residual(estimate, own) / torque
+    weights[:, names.index("offset")] = np.sqrt(as_one) * left / torque
     folds = tuple((train.expecting(weights), test) for train, test in evidence.folds)
-    return Evidence(whole.expecting(weights), folds)
+    return Evidence(whole.expecting(weights), folds), as_one
 
 
 def _towards(

@@ -216,7 +216,7 @@ Score = tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]
 """Log Bayes factor of each shape of a group, and the prior deviations at its likeliest scale."""
 
 
-def scan(problem: "Problem", design: Design, noise: Noise, families: Sequence[Family]) -> dict[int, Score]:
+def scan(problem: "Problem", design: Design, noise: Noise, some: Sequence[Family]) -> dict[int, Score]:
     """Scores of all groups of these families, by the group's identity."""
 
     def one(family: Family):
@@ -224,7 +224,7 @@ def scan(problem: "Problem", design: Design, noise: Noise, families: Sequence[Fa
 
     problem.whitened_joints(noise, design.terms)
     alike: dict[tuple, list] = defaultdict(list)
-    for part in parallel(one, families):
+    for part in parallel(one, some):
         alike[part[0].scales, part[1].shape[1]].append(part)
     out = {}
     for (scales, _), parts in alike.items():
