@@ -532,6 +532,8 @@ def _with_expected_offsets(table: Identification, evidence: Evidence) -> tuple[E
     if table.joint_covariance is not None:
         square = float(np.sum((left / sigma) ** 2)) / (whole.dof * whole.samples)
         as_one = samples_as_one(T, table.joint_covariance[: len(T), : len(T)], square)
+        if not np.isfinite(as_one):
+            raise InputError("joint_covariance: its variances are too large to be any; identify again")
     if "offset" not in names:
         return evidence, as_one
     torque = np.maximum(np.linalg.norm(whole.R[:, :, -1], axis=1), np.finfo(float).tiny)

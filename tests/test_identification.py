@@ -551,6 +551,7 @@ ROW = {"terms": {"m1": 1}, "value": 1.0}
         ({"coefficients": [ROW], "links": "link1"}, "links must be a list of texts"),
         ({"coefficients": [ROW], "friction": {"joint": 1}}, "friction is no list"),
         ({"coefficients": [ROW], "settings": 3}, "settings must be an object"),
+        ({"coefficients": [ROW], "joint_covariance": [[-1.0]]}, "joint_covariance has a negative variance"),
     ],
 )
 def test_a_malformed_file_is_refused_with_the_field_named(tmp_path, document, message):
@@ -595,6 +596,12 @@ def test_links_that_explain_less_than_the_coefficients_are_told():
     assert f"leave {links.relative_error_percent:.2f} %" in note
     plain = retrieve(found, arm=arm, starts=8, certificate=False)
     assert not [n for n in plain.notes if "contradict the recording" in n]
+
+
+def test_variances_that_overflow_are_refused(found):
+    huge = dataclasses.replace(found, joint_covariance=1e300 * np.eye(len(found.joint_covariance)))
+    with pytest.raises(InputError, match="joint_covariance: its variances are too large"):
+        retrieve(huge, starts=2, certificate=False)
 
 
 @pytest.mark.parametrize("method", ["trajectory", "one_step"])

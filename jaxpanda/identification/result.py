@@ -221,9 +221,9 @@ class Identification:
             ),
             std=std,
             classical_std=_column(rows, "classical_std", where),
-            covariance=read.array("covariance", (n, n)),
-            classical_covariance=read.array("classical_covariance", (n, n)),
-            joint_covariance=read.array("joint_covariance", (n + own, n + own)),
+            covariance=read.covariance("covariance", n),
+            classical_covariance=read.covariance("classical_covariance", n),
+            joint_covariance=read.covariance("joint_covariance", n + own),
             friction=rubs,
             standard=read.array("standard", (dof, 10)),
             rank=None if (rank := read.number("rank")) is None else int(rank),
@@ -317,6 +317,12 @@ class _Reader:
             size = " x ".join(str(n) for n in shape)
             raise InputError(f"{self.where}: {field} must hold {size} finite numbers")
         return array
+
+    def covariance(self, field: str, n: int) -> np.ndarray | None:
+        found = self.array(field, (n, n))
+        if found is not None and np.any(np.diag(found) < 0):
+            raise InputError(f"{self.where}: {field} has a negative variance; identify again")
+        return found
 
     def names(self, field: str) -> tuple[str, ...]:
         value = self.get(field, [])

@@ -128,14 +128,18 @@ def samples_as_one(
         T: a root of the information of independent samples, as weighted.
         covariance: of the estimate, robust.
         square: mean square of a weighted residual.
+
+    Returns:
+        At least one; not finite where the covariance is none of finite variances.
     """
     scale = np.linalg.norm(T, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     _, s, directions = np.linalg.svd(T / scale)
     told = s > np.sqrt(_TOLD) * s[0]
     moved = s[told, None] * directions[told] * scale
-    variance = float(np.mean(np.einsum("ia,ab,ib->i", moved, covariance, moved)))
-    return max(1.0, variance / max(square, np.finfo(float).tiny))
+    with np.errstate(over="ignore", invalid="ignore"):
+        variance = np.mean(np.einsum("ia,ab,ib->i", moved, covariance, moved))
+    return float(np.maximum(1.0, variance / max(square, np.finfo(float).tiny)))
 
 
 def _moves(
