@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
@@ -181,10 +180,8 @@ def _windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposa
             power = np.array([np.trace(p[1].sum((0, 1))) for p in parts]) + 1e-300
             each = np.stack([_passed(noise, j, bins, count) for j in range(problem.dof)])
             passed = power @ each / power.sum()
-        if design.factor is not None:
-            flat = np.swapaxes(C, 0, 1).reshape(C.shape[1], -1)
-            flat = scipy.linalg.solve_triangular(design.factor[0], flat, lower=True, check_finite=False)
-            C = np.swapaxes(flat.reshape(C.shape[1], len(C), -1), 0, 1)
+        flat = design.lowered(np.swapaxes(C, 0, 1).reshape(C.shape[1], -1))
+        C = np.swapaxes(flat.reshape(C.shape[1], len(C), -1), 0, 1)
         n = 6 * problem.dof  # of the contacts; the rest is the payload
         if len(pairs):
             found = [

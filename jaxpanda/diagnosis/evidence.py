@@ -22,7 +22,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 import scipy.special
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from .bodies import likeliest
 
@@ -159,12 +159,14 @@ class Columns(Sequence):
         """$A_j x$."""
         return sum((part @ x[at] for at, part in self.parts[joint]), np.zeros(self.rows))
 
-    def products(self, joint: int, F: Float[np.ndarray, "rows m"]) -> Float[np.ndarray, "n m"]:
-        """$A_j^\\top F$."""
-        out = np.zeros((self.width, F.shape[1]))
-        for at, part in self.parts[joint]:
-            out[at] = part.T @ F
-        return out
+    def products(self, joint: int, F: Float[np.ndarray, "rows m"]) -> Float[np.ndarray, "acting m"]:
+        """$A_j^\\top F$, of the columns that act there."""
+        return np.concatenate([np.zeros((0, F.shape[1])), *(part.T @ F for _, part in self.parts[joint])])
+
+    def acting(self, joint: int) -> Int[np.ndarray, " acting"]:
+        """Which columns act in a joint, in the order of `products`."""
+        each = [np.arange(at.start, at.stop) for at, _ in self.parts[joint]]
+        return np.concatenate([np.zeros(0, int), *each])
 
     def without(self, gone: slice) -> "Columns":
         """Less the columns of one term."""
@@ -237,6 +239,28 @@ class Design:
         """$H^{-1} y$."""
         return y if self.factor is None else scipy.linalg.cho_solve(self.factor, y)
 
+    @functools.cached_property
+    def _roots(self) -> dict[int, Float[np.ndarray, "acting acting"]]:
+        return {}
+
+    def explained(self, joint: int, F: Float[np.ndarray, "acting m"]) -> Float[np.ndarray, "acting m"]:
+        r"""C with $C^\top C = F^\top H^{-1} F$, F the products of what acts in one joint.
+
+        For many F: of $H^{-1} = R^\top R$ no more than the rows that act there is needed.
+        """
+        if not len(F):
+            return F
+        if joint not in self._roots:
+            here = self.lowered(np.eye(len(self.g))[:, self.columns.acting(joint)])
+            self._roots[joint] = np.linalg.qr(here, mode="r")
+        return self._roots[joint] @ F
+
+    def lowered(self, F: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+        r"""$L^{-1} F$ with $L L^\top = H$."""
+        if self.factor is None:
+            return F
+        return scipy.linalg.solve_triangular(self.factor[0], F, lower=True, check_finite=False)
+
     @property
     def covariance(self) -> Float[np.ndarray, "n n"]:
         """Of the coefficients, given the data."""
@@ -257,11 +281,8 @@ class Design:
         rows, m, n = Phi.shape
         flat = Phi.reshape(rows, m * n)
         b = (flat.T @ self.left[joint]).reshape(m, n)
-        if self.factor is not None:
-            C = self.columns.products(joint, flat)
-            C = scipy.linalg.solve_triangular(self.factor[0], C, lower=True, check_finite=False)
-            G = G - gram(C.reshape(-1, m, n))
-        return b, G
+        C = self.explained(joint, self.columns.products(joint, flat))
+        return b, G - gram(C.reshape(-1, m, n))
 
     def in_arm(
         self, Phi: Sequence[Float[np.ndarray, "rows m n"]], grams: Sequence[Float[np.ndarray, "m n n"]]
@@ -275,11 +296,8 @@ class Design:
             flat = F.reshape(len(F), m * n)
             b += (flat.T @ left).reshape(m, n)
             G += Q
-            C += self.columns.products(joint, flat)
-        if self.factor is not None:
-            C = scipy.linalg.solve_triangular(self.factor[0], C, lower=True, check_finite=False)
-            G = G - gram(C.reshape(-1, m, n))
-        return b, G
+            C[self.columns.acting(joint)] += self.columns.products(joint, flat)
+        return b, G - gram(self.lowered(C).reshape(-1, m, n))
 
 
 def gram(F: Float[np.ndarray, "rows m n"]) -> Float[np.ndarray, "m n n"]:

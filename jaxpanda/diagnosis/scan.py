@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
@@ -95,8 +94,9 @@ class Block:
 
     def products(
         self, problem: "Problem", noise: Noise, design: Design
-    ) -> tuple[Float[np.ndarray, "n n m"], Float[np.ndarray, " nm"], Float[np.ndarray, "p nm"]]:
-        r"""$\Phi^\top\Phi$ of each candidate (its lower triangle), $\Phi^\top r$ and $A^\top\Phi$, whitened."""
+    ) -> tuple[Float[np.ndarray, "n n m"], Float[np.ndarray, " nm"], Float[np.ndarray, "acting nm"]]:
+        r"""$\Phi^\top\Phi$ of each candidate (its lower triangle), $\Phi^\top r$ and $A^\top\Phi$ of what acts
+        in the joint, whitened."""
         here = problem.whitened_joint(noise, self.joint, design.terms)
         acting = [id(t) for t in design.terms if here.terms[id(t)][1] is not None]
         G, kept = here.blocks.get(self.key, (None, {}))
@@ -118,16 +118,8 @@ class Block:
             splits = np.cumsum([1 if w is None or w.ndim == 1 else w.shape[1] for w in wanted])[:-1]
             kept = kept | dict(zip(missing, np.split(found, splits), strict=True))
             here.blocks[self.key] = G, kept
-        A = np.zeros((len(design.g), self.x.shape[1]))
-        place = len(here.nuisance.T)
-        A[:place] = kept["nuisance"]
-        for term in design.terms:
-            width = term.width
-            if id(term) in acting:
-                A[place : place + width] = kept[id(term)]
-            place += width
         assert G is not None
-        return G, kept["residual"][0], A
+        return G, kept["residual"][0], np.concatenate([kept[key] for key in ("nuisance", *acting)])
 
 
 def projected(
@@ -136,15 +128,19 @@ def projected(
     """b and G (its lower triangle) of candidates that act in the joints of the blocks at once."""
     n = blocks[0].n
     parts = [block.products(problem, noise, design) for block in blocks]
-    G, Fr, FA = (sum(p[k] for p in parts[1:]) + parts[0][k] for k in range(3))
-    b = (Fr - design.x @ FA).reshape(n, -1)
-    if design.factor is not None:
-        C = scipy.linalg.solve_triangular(design.factor[0], FA, lower=True, check_finite=False)
-        C = C.reshape(len(C), n, -1)
-        G = G.copy()
-        for i in range(n):
-            for k in range(i + 1):
-                G[i, k] -= np.einsum("pm,pm->m", C[:, i], C[:, k])
+    G, Fr = (sum(p[k] for p in parts[1:]) + parts[0][k] for k in range(2))
+    if len(blocks) == 1:
+        places = design.columns.acting(blocks[0].joint)
+        FA, C = parts[0][2], design.explained(blocks[0].joint, parts[0][2])
+    else:
+        places, FA = np.arange(len(design.g)), np.zeros((len(design.g), len(Fr)))
+        for block, (*_, products) in zip(blocks, parts, strict=True):
+            FA[design.columns.acting(block.joint)] += products
+        C = design.lowered(FA)
+    b, C, G = (Fr - design.x[places] @ FA).reshape(n, -1), C.reshape(len(C), n, -1), G.copy()
+    for i in range(n):
+        for k in range(i + 1):
+            G[i, k] -= np.einsum("pm,pm->m", C[:, i], C[:, k])
     return b.T, np.moveaxis(G, 2, 0)
 
 
