@@ -11,7 +11,7 @@ Two premises come from the user: how well the model's numbers are known, and rec
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -20,7 +20,7 @@ from ..effects import CATALOGUE, AbstractEffect
 from . import knowledge as knowledge_
 from .noise import Saturation
 from .problem import Problem, Term, posed
-from .search import search
+from .search import laws, search
 from .state import State, gains, in_noise, likelier
 from .traces import Trace
 
@@ -93,10 +93,20 @@ def settled(
         log.append("suspect recordings beside them")
     premises = pose(traces, active, knowledge, background, scale=scale, catalogue=catalogue)
     premises = dataclasses.replace(premises, notes=notes)
-    state = search(premises.problem, log)
-    while (wider := _wider(premises, state)) is not None:
-        log.append(f"the model's numbers as {wider.knowledge!r}, {wider.scale:g} times: searched again")
-        other = search(wider.problem, log)
+    premises, state = _stepped(premises, laws(premises.problem, log), laws, log)
+    state = search(premises.problem, log, state)
+    return _stepped(premises, state, lambda problem, *by: search(problem, log, laws(problem, *by)), log)
+
+
+def _stepped(
+    premises: Premises, state: State, find: Callable[..., State], log: list[str]
+) -> tuple[Premises, State]:
+    """Premises under which the recordings are likelier, and the model that `find` comes to there, as long as
+    there are such."""
+    while (found := _wider(premises, state)) is not None:
+        wider, terms = found
+        log.append(f"the model's numbers as {wider.knowledge!r}, {wider.scale:g} times: searched on")
+        other = find(wider.problem, log, terms)
         gained = (
             likelier((premises.problem, state), (wider.problem, other)) + _price(wider) - _price(premises)
         )
@@ -112,23 +122,24 @@ def _price(premises: Premises) -> float:
     return next((p for k, x, p in RUNGS if (k, x) == (premises.knowledge, premises.scale)), 0.0)
 
 
-def _wider(premises: Premises, state: State) -> Premises | None:
-    """The supposition under which the recordings are likeliest beside the effects found, if it is a wider one."""
+def _wider(premises: Premises, state: State) -> tuple[Premises, tuple[Term, ...]] | None:
+    """The supposition under which the recordings are likeliest beside the effects found, if it is a wider one,
+    and which of them are needed there."""
     at = [i for i, (k, x, _) in enumerate(RUNGS) if (k, x) == (premises.knowledge, premises.scale)]
     problem = premises.problem
-    best, likeliest = None, state.score + _price(premises)
+    best, terms, likeliest = None, (), state.score + _price(premises)
     for k, x, price in RUNGS[at[0] + 1 :] if at else ():
         other = pose(
             problem.traces, problem.active, k, premises.background, problem.saturation, x, problem.catalogue
         )
-        value = _needed(other.problem, state).score + price
-        if value > likeliest:
-            best, likeliest = other, value
+        needed = _needed(other.problem, state)
+        if needed.score + price > likeliest:
+            best, terms, likeliest = other, needed.terms, needed.score + price
     if best is None:
         return None
     told = f"{best.knowledge!r}" + (f", {best.scale:g} times" if best.scale != 1 else "")
     note = f"the recordings contradict that the model's numbers are known as {premises.knowledge!r}"
-    return dataclasses.replace(best, notes=(*premises.notes, f"{note}: they were taken as {told}"))
+    return dataclasses.replace(best, notes=(*premises.notes, f"{note}: they were taken as {told}")), terms
 
 
 def _needed(problem: Problem, state: State) -> State:

@@ -27,7 +27,6 @@ from .state import (
     likelier,
     overlaps,
     places,
-    start,
     with_terms,
     without,
 )
@@ -59,21 +58,29 @@ _OVERLAP, _FELT = 0.05, 0.02
 _SETTLED = 4
 
 
-def search(problem: Problem, log: list[str] | None = None) -> State:
-    """The likeliest model that was found.
+def laws(problem: Problem, log: list[str] | None = None, terms: Sequence[Term] = ()) -> State:
+    """The likeliest model of laws alone that steps from one with these terms lead to."""
+    return climb(problem, with_terms(problem, terms), _said(log), free=False)
+
+
+def search(problem: Problem, log: list[str] | None = None, state: State | None = None) -> State:
+    """The likeliest model that was found; `state`: where `laws` has ended already.
 
     Laws come before free forms, which fit what several laws do together and hold nowhere else. Where many laws
     are needed the arm may be one whose every joint rubs, as real ones do: another search begins at what is
     common in every joint.
     """
-    say = log.append if log is not None else (lambda _: None)
-    state = climb(problem, start(problem), say, free=False)
+    say, state = _said(log), laws(problem, log) if state is None else state
     if len(state.terms) >= _CROWDED:
         say("another beginning: what is common, at all joints")
         common = with_terms(problem, everywhere(problem, state.noise))
         state = _likelier(problem, state, climb(problem, common, say, free=False), say)
     say("free forms")
     return _likelier(problem, state, climb(problem, state, say), say)
+
+
+def _said(log: list[str] | None) -> Any:
+    return (lambda _: None) if log is None else log.append
 
 
 def _likelier(problem: Problem, state: State, other: State, say: Any) -> State:
