@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from ..effects import CATALOGUE, AbstractEffect
 from . import knowledge as knowledge_
+from .grid import Grid
 from .noise import Saturation
 from .problem import Problem, Term, posed
 from .search import laws, search
@@ -61,6 +62,7 @@ def pose(
     saturated: Saturation | None = None,
     scale: float = 1.0,
     catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE,
+    shapes: Grid | None = None,
 ) -> Premises:
     """The problem of these recordings under what is known; `scale` multiplies the uncertainty of the inertias."""
     arm = traces[0].motion.arm
@@ -69,7 +71,7 @@ def pose(
     std = empty.noise(()).std
     spread = scale * knowledge_.inertial_spread(arm, knowledge, std)
     columns, numbers = knowledge_.nuisance(traces, spread, knowledge, std, scale)
-    problem = posed(traces, active, columns, background, empty.saturation, numbers, catalogue)
+    problem = posed(traces, active, columns, background, empty.saturation, numbers, catalogue, shapes)
     return Premises(problem, spread, knowledge, scale, problem.background)
 
 
@@ -130,7 +132,14 @@ def _wider(premises: Premises, state: State) -> tuple[Premises, tuple[Term, ...]
     best, terms, likeliest = None, (), state.score + _price(premises)
     for k, x, price in RUNGS[at[0] + 1 :] if at else ():
         other = pose(
-            problem.traces, problem.active, k, premises.background, problem.saturation, x, problem.catalogue
+            problem.traces,
+            problem.active,
+            k,
+            premises.background,
+            problem.saturation,
+            x,
+            problem.catalogue,
+            problem.grid,
         )
         needed = _needed(other.problem, state)
         if needed.score + price > likeliest:

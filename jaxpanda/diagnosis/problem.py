@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import itertools
 import operator
-import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -17,18 +16,16 @@ from .. import signals as signals_
 from ..arm import Arm
 from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect, Channels, Stretches, joint_columns
 from ..errors import InputError
-from . import catchall
 from .bodies import Body, body
 from .discrepancy import at_rest, of_law, unresolved, unresolved_known
 from .evidence import Columns, Design, Noise
+from .grid import Grid
 from .host import parallel
-from .library import Candidates, build, columns_of
+from .library import Candidates
 from .noise import ORDER, QUIETEST, Saturation
 from .scan import Block, Family, Score, Whitened, families, projected, scan
 from .traces import Trace
 
-_MEMORY = 1 << 28
-"""Bytes of columns of shapes off the grid that are kept."""
 _UNHEARD = 1e9
 """Innovations of a joint that no recording tells anything about [N m]."""
 _PICKED = 64
@@ -118,17 +115,12 @@ class Problem:
     """That of the same recordings, where a problem posed otherwise has made it already."""
     catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE
     """Effects that are tried."""
-    _lock: threading.Lock = dataclasses.field(
-        default_factory=threading.Lock, init=False, repr=False, compare=False
-    )
-    """Of what `columns` keeps."""
+    shapes: Grid | None = dataclasses.field(default=None, repr=False, compare=False)
+    """Those of the same recordings and effects, likewise."""
 
     def __getstate__(self) -> dict[str, Any]:
         """For pickle: the fields, without what can be made again."""
-        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.init}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _lock=threading.Lock())
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)} | {"shapes": None}
 
     @property
     def arm(self) -> Arm:
@@ -145,26 +137,23 @@ class Problem:
         return [trace.residual for trace in self.traces]
 
     @functools.cached_property
+    def grid(self) -> Grid:
+        """Shapes of effects on these recordings, and their columns."""
+        return self.shapes or Grid(self.traces, self.active, self.catalogue)
+
+    @property
     def library(self) -> list[Candidates]:
         """The catalogue on these recordings; zero in those of reference."""
-        out = []
-        for c in build(self.traces, self.catalogue):
-            columns = tuple(
-                x if on else np.zeros_like(x) for x, on in zip(c.columns, self.active, strict=True)
-            )
-            out.append(dataclasses.replace(c, columns=columns))
-        return out
+        return self.grid.library
 
-    @functools.cached_property
+    @property
     def catchalls(self) -> list[Candidates]:
         """Free forms on these recordings; zero in those of reference."""
-        out = []
-        for c in catchall.build(self.traces):
-            columns = tuple(
-                x if on else np.zeros_like(x) for x, on in zip(c.columns, self.active, strict=True)
-            )
-            out.append(dataclasses.replace(c, columns=columns))
-        return out
+        return self.grid.catchalls
+
+    def columns(self, effects: Sequence[AbstractEffect]) -> list[Float[np.ndarray, "_time ..."]]:
+        """Columns of shapes of one form at one place in all recordings, as `library.columns_of`."""
+        return self.grid.columns(effects)
 
     @property
     def shaken(self) -> slice:
@@ -218,51 +207,6 @@ class Problem:
             wide[:, effect.joints[0]] = c[:, 0]
             out.append(wide)
         return out
-
-    @functools.cached_property
-    def _evaluated(self) -> dict[tuple, list[np.ndarray]]:
-        """Columns of shapes met before: a search tries many again."""
-        known = {}
-        for group in (*self.library, *self.catchalls):
-            for i, effect in enumerate(group.effects):
-                known[key_of(effect)] = [c[..., i, :] for c in group.columns]
-        return known
-
-    def columns(self, effects: Sequence[AbstractEffect]) -> list[Float[np.ndarray, "_time ..."]]:
-        """Columns of shapes of one form at one place in all recordings, as `columns_of`."""
-        with self._lock:
-            known = {key: self._evaluated[key] for e in effects if (key := key_of(e)) in self._evaluated}
-        new = [e for e in effects if key_of(e) not in known]
-        if new:
-            columns = []
-            for r, trace in enumerate(self.traces):
-                here = self.placed(new, r)
-                columns.append(columns_of(here, trace) if here else 0.0 * columns_of(new, trace))
-            fresh = {key_of(effect): [c[..., i, :] for c in columns] for i, effect in enumerate(new)}
-            known.update(fresh)
-            with self._lock:
-                if sum(self._later.values()) > _MEMORY:
-                    for key in self._later:
-                        del self._evaluated[key]
-                    self._later.clear()
-                self._later.update({key: sum(c.nbytes for c in kept) for key, kept in fresh.items()})
-                self._evaluated.update(fresh)
-        each = [known[key_of(e)] for e in effects]
-        return [np.stack([c[r] for c in each], -2) for r in range(len(self.traces))]
-
-    @functools.cached_property
-    def _later(self) -> dict[tuple, int]:
-        """Which of these are no shapes of the grids, and their bytes."""
-        return {}
-
-    def placed(self, effects: Sequence[AbstractEffect], r: int) -> list[AbstractEffect]:
-        """What of shapes of one form acts in a recording; empty if nothing does."""
-        if not self.active[r]:
-            return []
-        names = [t.name for t in self.traces]
-        bound = getattr(effects[0], "recording", None)
-        later = None if bound is None else r > names.index(bound)
-        return [p for e in effects if (p := e.placed(names[r], later)) is not None]
 
     def whitened(self, columns: Sequence[np.ndarray], noise: Noise, joint: int) -> np.ndarray:
         """Rows of a joint in all recordings, one below the other, with unit noise."""
@@ -499,7 +443,7 @@ class Problem:
             motion = trace.motion
             known = motion.q, motion.qd, motion.qdd, motion.load, trace.tau - trace.residual
             channels = Channels(motion.time, *known, shown=trace.tau - wrong[rows])
-            for here in self.placed([effect], r):
+            for here in self.grid.placed([effect], r):
                 values = joint_columns([here], Stretches(channels), motion.dt)  # pyright: ignore
                 columns[rows, here.joints[0]] = values[:, 0]
         return columns
@@ -589,11 +533,6 @@ def _solver(H: Float[np.ndarray, "n n"]) -> Callable[[np.ndarray], np.ndarray]:
     return lambda y: (unit * scipy.linalg.cho_solve(factor, (unit * y.T).T).T).T
 
 
-def key_of(effect: AbstractEffect) -> tuple:
-    """What makes two shapes the same."""
-    return type(effect).__name__, *(getattr(effect, f.name) for f in dataclasses.fields(effect))
-
-
 def posed(
     traces: tuple[Trace, ...],
     active: tuple[bool, ...],
@@ -602,6 +541,7 @@ def posed(
     saturated: Saturation | None = None,
     numbers: int | None = None,
     catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE,
+    shapes: Grid | None = None,
 ) -> Problem:
     """A problem whose background acts in all recordings: its columns, by their deviations, end the nuisance."""
     everywhere = Problem(traces, (True,) * len(traces), tuple(nuisance))
@@ -609,4 +549,4 @@ def posed(
     wide = [
         np.concatenate([n, *(t.columns[r] * t.deviation for t in terms)], 2) for r, n in enumerate(nuisance)
     ]
-    return Problem(traces, active, tuple(wide), terms, numbers, saturated, catalogue)
+    return Problem(traces, active, tuple(wide), terms, numbers, saturated, catalogue, shapes)

@@ -74,7 +74,9 @@ def search(problem: Problem, log: list[str] | None = None, state: State | None =
     if len(state.terms) >= _CROWDED:
         say("another beginning: what is common, at all joints")
         common = with_terms(problem, everywhere(problem, state.noise))
-        state = _likelier(problem, state, climb(problem, common, say, free=False), say)
+        other = climb(problem, common, say, free=False, met=names(state))
+        if names(other) != names(state):
+            state = _likelier(problem, state, other, say)
     say("free forms")
     return _likelier(problem, state, climb(problem, state, say), say)
 
@@ -92,15 +94,20 @@ def _likelier(problem: Problem, state: State, other: State, say: Any) -> State:
     return other if gained > 0 else state
 
 
-def climb(problem: Problem, state: State, say: Any, *, free: bool = True) -> State:
-    """Steps to a likelier model, as long as they lead to another; with free forms, or laws only."""
+def climb(problem: Problem, state: State, say: Any, *, free: bool = True, met: Sequence[str] = ()) -> State:
+    """Steps to a likelier model, as long as they lead to another; with free forms, or laws only.
+
+    `met`: the laws that other steps have ended with. Where these come to the same they would lead on alike.
+    """
     for _ in range(_ROUNDS):
         before = state
         state = prune(problem, grow(problem, state, say, free), say)
+        if met and names(state) == list(met):
+            break
         state = exchange(problem, state, say, free)
         state = merge(problem, state, say, free)
         state = prune(problem, state, say)
-        if sorted(map(name, state.terms)) == sorted(map(name, before.terms)):
+        if names(state) == names(before):
             break
     return state
 
@@ -427,8 +434,13 @@ def is_undetermined(state: State, i: int) -> bool:
     return max(rms(part) for part in np.moveaxis(parts, -1, 0)) > OPPOSED * rms(parts.sum(-1))
 
 
+def names(state: State) -> list[str]:
+    """Of its laws, whatever their numbers."""
+    return sorted(map(name, state.terms))
+
+
 def name(term: Term) -> str:
-    """For the log."""
+    """Law and joints."""
     form = getattr(term.effect, "form", "")
     return f"{term.key[0]}{[j + 1 for j in term.key[1]]}{form and f' ({form})'}"
 
