@@ -375,8 +375,8 @@ def test_a_round_that_leads_back_to_the_same_terms_is_the_last(monkeypatch):
 def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_hardly_believed():
     problem = posed(record(7, lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) == 1)))
     state = with_terms(problem, [problem.term(CoulombFriction(1, 0.01), np.array([0.5]))])
-    (sure,) = findings(problem, state, state, [False])
-    (lost,) = findings(problem, state, state, [True])
+    (sure,) = findings(problem, state, state, state, [False])
+    (lost,) = findings(problem, state, state, state, [True])
     assert (sure.effect, lost.effect) == ("coulomb_friction", "coulomb_friction")
     assert sure.confidence > 0.9
     assert lost.confidence <= 0.1
@@ -389,7 +389,7 @@ def test_a_law_foretells_torque_where_it_is_there_and_none_where_it_is_not():
     there, absent = foretold(problem, with_terms(problem, both), [[0], [1]])
     assert there > 20
     assert absent < 1
-    (of_finding,) = findings(problem, alone := with_terms(problem, both[:1]), alone, [False])
+    (of_finding,) = findings(problem, alone := with_terms(problem, both[:1]), alone, alone, [False])
     assert of_finding.foretold == pytest.approx(there, rel=0.2)
     assert of_finding.to_json()["held_out_nats"] == of_finding.foretold
 
@@ -414,10 +414,10 @@ def test_what_acts_along_a_joint_that_slides_is_told_in_newtons_and_metres():
     problem = pose((prepare(record(7, rubs, arm=arm), arm),), (True,), "exact").problem
     terms = [problem.term(e, np.ones(1)) for e in (CoulombFriction(5, 0.01), CoulombFriction(6, 0.01))]
     both_laws = with_terms(problem, terms)
-    (both,) = findings(problem, both_laws, both_laws, [False, False])
+    (both,) = findings(problem, both_laws, both_laws, both_laws, [False, False])
     assert [p["unit"] for p in both.parameters] == ["N·m", "rad/s", "N", "m/s"]
     alone = with_terms(problem, terms[1:])
-    slides, _ = findings(problem, alone, alone, [False])  # and what the other joint is off
+    slides, _ = findings(problem, alone, alone, alone, [False])  # and what the other joint is off
     assert " N rms" in slides.summary
 
 

@@ -430,7 +430,7 @@ def test_the_parts_of_a_law_take_the_place_of_one_that_is_nothing_but_their_sum(
     law, c = StribeckFriction(3, 0.3, 0.01, 2.0, "viscous"), np.array([0.8, 0.01, 2.0])
     sums = problem.term(law, np.ones(3), c, std, -40.0)
     state = with_terms(problem, [*others, sums])
-    assert [t.key for t in instead(problem, state, 4)[0][1]] == [
+    assert [t.key for t in instead(problem, state, 4)[0][0][1]] == [
         ("coulomb_friction", (3,)),
         ("viscous_friction", (3,)),
     ]

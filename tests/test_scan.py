@@ -104,6 +104,6 @@ def test_noise_is_estimated_anew_only_where_a_term_acts(problem: Problem):
 def test_a_term_defends_its_place_with_its_own_shape(problem: Problem):
     """What the scan finds of its kind is not always refined; the term's shape may be likelier by far."""
     state = search.with_terms(problem, [problem.term(TorqueRipple(3, 33.7, "one"), np.array([1.0, 1.0]))])
-    found = search.instead(problem, state, 0)
+    found, _ = search.instead(problem, state, 0)
     (gained,) = [gained for gained, terms in found if terms == state.terms]
     assert gained == pytest.approx(search.gains(problem, state)[0])

@@ -37,16 +37,19 @@ REFITTED = 0.9
 """Confidence that a model's numbers are wrong, where their refit explains what differs and nothing else does."""
 
 
-def findings(problem: Problem, state: State, laws: State, lost: Sequence[bool]) -> list[Finding]:
+def findings(
+    problem: Problem, searched: State, state: State, laws: State, lost: Sequence[bool]
+) -> list[Finding]:
     """The accepted terms as findings, those that explain most first.
 
     Args:
         problem: the recordings.
-        state: the likeliest model.
+        searched: the likeliest model as the search left it, by which its terms are weighed against their rivals.
+        state: the same with its shapes polished.
         laws: the same without discrepancy, as the corrected model has them: what is told of torque and numbers.
         lost: which of its terms predict torque no better where they were not fitted.
     """
-    rivals = [_rivals(problem, state, i) for i in range(len(state.terms))]
+    rivals = [_rivals(problem, searched, state, i) for i in range(len(state.terms))]
     groups = together(problem, state.terms)
     names = titles(state.terms)
     doubt = np.where(lost, MISLEADS, 1.0)
@@ -169,10 +172,10 @@ def _same(problem: Problem, a: Term, b: Term) -> bool:
     return a.effect.joints == b.effect.joints or len(_intervals(problem, [a, b])) == 1
 
 
-def _rivals(problem: Problem, state: State, i: int) -> tuple[float, dict[str, float], float]:
+def _rivals(problem: Problem, searched: State, state: State, i: int) -> tuple[float, dict[str, float], float]:
     """Evidence of a term, probability of each effect in its place, its own included."""
     evidence = state.design.log_evidence - without(state, i).log_evidence
-    probability = posterior(problem, state, i)
+    probability = posterior(problem, searched, i)
     return evidence, probability, probability.get(state.terms[i].effect.title, 0.0)
 
 

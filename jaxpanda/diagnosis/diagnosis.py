@@ -225,10 +225,10 @@ def diagnose(
         return wrongly_read
     progress("looking for effects that make the recordings likelier; that takes most of the time")
     log = _Log(progress)
-    premises, state = settled(tuple(traces), tuple(active), knowledge, log, catalogue=catalogue)
+    premises, searched = settled(tuple(traces), tuple(active), knowledge, log, catalogue=catalogue)
     problem = premises.problem
     progress("refining the numbers, and weighing what else it could be")
-    state = polished(problem, state)
+    state = polished(problem, searched)
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
     contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
     wrong = numbers(problem, state, premises.changes) if contradicted else []
@@ -239,7 +239,7 @@ def diagnose(
         kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
         corrected = correct(kept)
     lost = [all(t is not k for k in kept.terms) for t in laws.terms]
-    found, fitted = [*findings(problem, state, laws, lost), *wrong], fit(problem, kept)
+    found, fitted = [*findings(problem, searched, state, laws, lost), *wrong], fit(problem, kept)
     more = partly(problem, state) or not all(_judged(problem))
     answer = verdict(found, fitted, more)
     told, notes = calibrated(found, answer, fitted), list(premises.notes)

@@ -252,7 +252,7 @@ class Design:
             return F
         if joint not in self._roots:
             here = self.lowered(np.eye(len(self.g))[:, self.columns.acting(joint)])
-            self._roots[joint] = np.linalg.qr(here, mode="r")
+            self._roots[joint] = np.asarray(np.linalg.qr(here, mode="r"))
         return self._roots[joint] @ F
 
     def lowered(self, F: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:

@@ -244,7 +244,7 @@ class Problem:
 
     @functools.cached_property
     def tried(self) -> dict[tuple, Any]:
-        """Steps of a search that have been tried, and with what."""
+        """Steps of a search that have been tried, and what was found."""
         return {}
 
     @functools.cached_property

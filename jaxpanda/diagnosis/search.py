@@ -129,11 +129,8 @@ def choices(
     """What the foremost proposals bring with their discrepancies, beside these terms; the likeliest first."""
     if not proposals:
         return []
-    own = evidence(problem, terms, design, noise)
-    best = proposals[0].evidence
-    some = [p for p in proposals if p.evidence > (_WINDOW * best if best > 0 else UNLIKELY)][:_TRIED]
-    out = []
-    for p in some:
+    own, out = evidence(problem, terms, design, noise), []
+    for p in _likeliest(proposals):
         for form in (p, *plainer(problem, design, noise, p)):
             term = taken(problem, design, noise, form)
             more = problem.design((*terms, term), noise)
@@ -142,6 +139,12 @@ def choices(
                 out.append((found - own + term.prior, (term,)))
             problem.forget(term)
     return sorted(out, key=lambda choice: -choice[0])
+
+
+def _likeliest(proposals: Sequence[Proposal]) -> list[Proposal]:
+    """Those that are weighed."""
+    best = max((p.evidence for p in proposals[:1]), default=0.0)
+    return [p for p in proposals if p.evidence > (_WINDOW * best if best > 0 else UNLIKELY)][:_TRIED]
 
 
 def is_possible(term: Term, design: Design) -> bool:
@@ -203,9 +206,12 @@ def prune(problem: Problem, state: State, say: Any) -> State:
 def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> State:
     """Put in the place of each term what is likelier there."""
     for i in range(len(state.terms)):
-        if not _is_new(problem, ("exchange", free), state, (i,)):
+        step = Step(state, "exchange", (i,))
+        if step.key(free) in problem.tried:
             continue
-        found = instead(problem, state, i, free)
+        found, barred = instead(problem, state, i, free)
+        told = tuple((gained, tuple(t.effect.title for t in by)) for gained, by in found)
+        problem.tried.update(step.tried(free, barred, told))
         own, best = next(gained for gained, terms in found if terms[0] is state.terms[i]), found[0]
         if best[0] > own + BETTER:
             if [t.key for t in best[1]] != [state.terms[i].key]:
@@ -215,16 +221,28 @@ def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> Sta
     return state
 
 
-def _is_new(problem: Problem, step: tuple[str, bool], state: State, which: Sequence[int]) -> bool:
-    """Whether a step has not been tried yet with these terms, beside the others that act in the same joints."""
-    share = state.shares
-    near = (share @ share[list(which)].T).max(1) > _OVERLAP
-    terms = [state.terms[i] for i in which], [t for t, on in zip(state.terms, near, strict=True) if on]
-    key = *step, *(tuple(sorted(map(id, some))) for some in terms)
-    if key in problem.tried:
-        return False
-    problem.tried[key] = terms  # kept, lest its identities be used again
-    return True
+class Step:
+    """What tells one step of a search from another: its terms, and those that act in the same joints."""
+
+    def __init__(self, state: State, kind: str, which: Sequence[int]):
+        share = state.shares
+        beside = (share @ share[list(which)].T).max(1) > _OVERLAP
+        self.kind = kind
+        self.terms = (
+            [state.terms[i] for i in which],
+            [t for t, on in zip(state.terms, beside, strict=True) if on],
+        )
+
+    def key(self, free: bool) -> tuple:
+        """By the terms' identities."""
+        return self.kind, free, *(tuple(sorted(map(id, some))) for some in self.terms)
+
+    def tried(
+        self, free: bool, barred: bool, found: Sequence[tuple[float, tuple[str, ...]]] = ()
+    ) -> dict[tuple, tuple["Step", Sequence[tuple[float, tuple[str, ...]]]]]:
+        """For `Problem.tried`: the step, whose terms are kept lest their identities be used again, and what was
+        found; with free forms too where none of them was `barred`."""
+        return {self.key(one): (self, found) for one in ({free} if barred else {free, True})}
 
 
 def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
@@ -239,7 +257,8 @@ def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
         wide = [i for i, t in enumerate(state.terms) if not isinstance(t.effect, AbstractJointEffect)]
         pairs = [p for p in overlaps(state) if set(p) <= set(wide)]
         for group in dict.fromkeys((*(g for g in groups if len(g) > 1), *pairs)):
-            if not _is_new(problem, ("merge", free), state, group):
+            step = Step(state, "merge", group)
+            if step.key(free) in problem.tried:
                 continue
             others = tuple(t for i, t in enumerate(state.terms) if i not in group)
             design = problem.design(others, state.noise)
@@ -248,13 +267,9 @@ def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
             joints = None
             if all(isinstance(state.terms[i].effect, AbstractJointEffect) for i in group):
                 joints = {j for i in group for j in state.terms[i].effect.joints}
-            found = choices(
-                problem,
-                others,
-                design,
-                state.noise,
-                _new(others, ranked(problem, design, state.noise, joints), free),
-            )
+            proposals = ranked(problem, design, state.noise, joints)
+            problem.tried.update(step.tried(free, not free and _lets_free_in(others, proposals)))
+            found = choices(problem, others, design, state.noise, _new(others, proposals, free))
             if found and found[0][0] > own + BETTER:
                 fewer = with_terms(problem, (*others, *found[0][1]))
                 if likelier((problem, state), (problem, fewer)) < 0:
@@ -267,41 +282,35 @@ def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
             return state
 
 
-def instead(problem: Problem, state: State, i: int, free: bool = True) -> list[Choice]:
+def instead(problem: Problem, state: State, i: int, free: bool = True) -> tuple[list[Choice], bool]:
     """What each effect would bring in a term's place, where the term acts, the likeliest first; the term itself
-    is among them."""
+    is among them. And whether free forms that were not let in would have been weighed."""
     others = tuple(t for k, t in enumerate(state.terms) if k != i)
     term, rest = state.terms[i], without(state, i)
     acts = set(term.effect.joints) if isinstance(term.effect, AbstractJointEffect) else {
         int(j) for j in np.flatnonzero(state.shares[i] > _FELT)
     }  # fmt: skip
-    proposals = _new(others, ranked(problem, rest, state.noise, acts), free)
-    found = choices(problem, others, rest, state.noise, proposals)
+    proposals = ranked(problem, rest, state.noise, acts)
+    found = choices(problem, others, rest, state.noise, _new(others, proposals, free))
+    barred = not free and _lets_free_in(others, proposals)
     crowd = np.flatnonzero(state.shares @ state.shares[i] > _OVERLAP)
     if not term.effect.bound_to_recording and len(crowd) <= _FEW:
-        rivals = [choice for choice in found if choice[1][0].key != term.key][:_PAIRED]
-        found += [
-            pair for one in rivals if (pair := _with_another(problem, others, state.noise, one, acts, free))
-        ]
+        for one in [choice for choice in found if choice[1][0].key != term.key][:_PAIRED]:
+            terms = (*others, *one[1])
+            design = problem.design(terms, state.noise)
+            proposals = [p for p in ranked(problem, design, state.noise, acts) if p.evidence > 0]
+            barred |= not free and _lets_free_in(terms, proposals)
+            beside_it = choices(problem, terms, design, state.noise, _new(terms, proposals, free))
+            if beside_it and beside_it[0][0] > 0:
+                found.append((one[0] + beside_it[0][0], (*one[1], *beside_it[0][1])))
         found += _parts(problem, others, state.noise, term, acts, free)
     own = evidence(problem, state.terms, state.design, state.noise) - beside(problem, state, (i,), rest)
-    return sorted([(own, (term,)), *found], key=lambda choice: -choice[0])
+    return sorted([(own, (term,)), *found], key=lambda choice: -choice[0]), barred
 
 
-def _with_another(
-    problem: Problem,
-    others: Sequence[Term],
-    noise: Noise,
-    choice: Choice,
-    joints: Collection[int],
-    free: bool,
-) -> Choice | None:
-    """A choice and what is likeliest beside it in the same joints; None where nothing is."""
-    terms = (*others, *choice[1])
-    design = problem.design(terms, noise)
-    proposals = [p for p in _new(terms, ranked(problem, design, noise, joints), free) if p.evidence > 0]
-    found = choices(problem, terms, design, noise, proposals)
-    return (choice[0] + found[0][0], (*choice[1], *found[0][1])) if found and found[0][0] > 0 else None
+def _lets_free_in(terms: Sequence[Term], proposals: Sequence[Proposal]) -> bool:
+    """Whether free forms are among what is weighed of these."""
+    return any(p.effect.free for p in _likeliest(_new(terms, proposals, free=True)))
 
 
 def _parts(
@@ -336,13 +345,18 @@ def _new(terms: Sequence[Term], proposals: Sequence[Proposal], free: bool) -> li
 def posterior(problem: Problem, state: State, i: int) -> dict[str, float]:
     """Probability of each effect in a term's place, the other terms given: of models that have the term's effect,
     and of others by their first; none at all takes the rest."""
-    found = instead(problem, state, i)
+    step = Step(state, "exchange", (i,))
+    if step.key(True) in problem.tried:
+        _, found = problem.tried[step.key(True)]
+    else:
+        found = [
+            (gained, tuple(t.effect.title for t in terms)) for gained, terms in instead(problem, state, i)[0]
+        ]
     weights = np.array([0.0, *(gained for gained, _ in found)]) / TEMPERATURE
     shares_ = np.exp(weights - scipy.special.logsumexp(weights))
     out: dict[str, float] = {}
     own = state.terms[i].effect.title
-    for (_, terms), p in zip(found, shares_[1:], strict=True):
-        titles = [t.effect.title for t in terms]
+    for (_, titles), p in zip(found, shares_[1:], strict=True):
         title = own if own in titles else titles[0]
         out[title] = out.get(title, 0.0) + float(p)
     return out
