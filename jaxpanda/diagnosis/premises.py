@@ -96,8 +96,10 @@ def settled(
     premises = pose(traces, active, knowledge, background, scale=scale, catalogue=catalogue)
     premises = dataclasses.replace(premises, notes=notes)
     premises, state = _stepped(premises, laws(premises.problem, log), laws, log)
-    state = search(premises.problem, log, state)
-    return _stepped(premises, state, lambda problem, *by: search(problem, log, laws(problem, *by)), log)
+    found = search(premises.problem, log, state)
+    if found is state:  # other premises have been tried with it
+        return premises, state
+    return _stepped(premises, found, lambda problem, *by: search(problem, log, laws(problem, *by)), log)
 
 
 def _stepped(
