@@ -20,7 +20,7 @@ from jaxpanda.diagnosis.events import windows
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.proposals import grids
-from jaxpanda.diagnosis.search import climb, merge, search
+from jaxpanda.diagnosis.search import climb, exchange, merge, names, posterior, search
 from jaxpanda.diagnosis.shapes import refine
 from jaxpanda.diagnosis.state import likelier, misfit, places, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
@@ -369,6 +369,33 @@ def test_a_round_that_leads_back_to_the_same_terms_is_the_last(monkeypatch):
         monkeypatch.setattr(f"jaxpanda.diagnosis.search.{step}", lambda problem, state, *_: state)
     climb(problem, start(problem), lambda _: None)
     assert len(rounds) == 2
+
+
+def test_a_search_that_comes_to_the_laws_of_another_ends_there(monkeypatch):
+    """From there it would go on as that one did, which had ended."""
+    problem = posed(record(7))
+    met = with_terms(problem, [problem.term(CoulombFriction(1, 0.01), np.array([0.5]))])
+    other = with_terms(problem, [problem.term(CoulombFriction(1, 0.02), np.array([0.5]))])
+    monkeypatch.setattr("jaxpanda.diagnosis.search.grow", lambda *_: other)
+    monkeypatch.setattr("jaxpanda.diagnosis.search.prune", lambda problem, state, *_: state)
+    monkeypatch.setattr("jaxpanda.diagnosis.search.exchange", lambda *_: pytest.fail("searched on"))
+    assert climb(problem, start(problem), lambda _: None, met=names(met)) is other
+
+
+@pytest.mark.parametrize("barred", [False, True])
+def test_a_step_is_tried_again_with_free_forms_where_they_were_barred(monkeypatch, barred):
+    problem, tried = posed(record(7)), []
+    state = with_terms(problem, [problem.term(CoulombFriction(1, 0.01), np.array([0.5]))])
+
+    def instead(problem, state, i, free):
+        tried.append(free)
+        return [(1.0, (state.terms[i],))], barred and not free
+
+    monkeypatch.setattr("jaxpanda.diagnosis.search.instead", instead)
+    for free in (False, False, True, True):
+        assert exchange(problem, state, lambda _: None, free) is state
+    assert tried == ([False, True] if barred else [False])
+    assert posterior(problem, state, 0) == {"coulomb_friction": pytest.approx(1 / (1 + np.exp(-1 / 3)))}
 
 
 @pytest.mark.slow

@@ -1,10 +1,13 @@
 """What a diagnosis starts from: the known may be widened, and what healthy recordings show counts everywhere."""
 
 import numpy as np
+import pytest
 
 from jaxpanda import Arm
+from jaxpanda.diagnosis import premises
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
+from jaxpanda.diagnosis.state import start
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.export import panda_mjcf
@@ -28,3 +31,17 @@ def test_what_healthy_recordings_show_may_be_refitted_in_all_recordings():
     news = problem.full_columns(TorqueOffset(3))
     assert np.any(news[0])
     assert not np.any(news[1])  # an effect that is searched for acts in the suspect recording alone
+
+
+@pytest.mark.parametrize("further", [False, True])
+def test_premises_are_weighed_again_only_with_another_model(monkeypatch, further):
+    trace = prepare(
+        simulate(panda_mjcf(), random_trajectory(panda_mjcf(), 1, period=3.0), duration=3.0, rate=200.0,
+                 friction=JointFriction(), sensors=Sensors(torque_noise=0.05)), Arm.panda())  # fmt: skip
+    weighed = []
+    monkeypatch.setattr(premises, "laws", lambda problem, log, terms=(): start(problem))
+    monkeypatch.setattr(premises, "search", lambda problem, log, state: start(problem) if further else state)
+    monkeypatch.setattr(premises, "_wider", lambda _, state: weighed.append(state))
+    _, state = premises.settled((trace,), (True,), "identified", [])
+    assert len(weighed) == (2 if further else 1)
+    assert state is weighed[-1]

@@ -107,3 +107,23 @@ def test_a_term_defends_its_place_with_its_own_shape(problem: Problem):
     found, _ = search.instead(problem, state, 0)
     (gained,) = [gained for gained, terms in found if terms == state.terms]
     assert gained == pytest.approx(search.gains(problem, state)[0])
+
+
+def test_what_a_model_explains_of_a_joints_candidates_takes_its_coefficients_there_alone(problem: Problem):
+    terms = [problem.term(CoulombFriction(j, 0.01), np.array([0.3])) for j in (1, 3)]
+    design = problem.design(terms, problem.noise(terms))
+    Phi = np.random.default_rng(0).normal(size=(len(design.residual[3]), 4, 2))
+    b, G = design.in_joint(3, Phi, np.einsum("tma,tmb->mab", Phi, Phi))
+    A = design.columns[3]
+    for m in range(4):
+        left = Phi[:, m].T @ Phi[:, m] - Phi[:, m].T @ A @ design.solve(A.T @ Phi[:, m])
+        assert G[m] == pytest.approx(left, rel=1e-9, abs=1e-9)
+        assert b[m] == pytest.approx(Phi[:, m].T @ (design.residual[3] - A @ design.x), rel=1e-9, abs=1e-9)
+
+
+def test_shapes_are_evaluated_once_for_all_premises(problem: Problem):
+    wider = pose(problem.traces, problem.active, "rough", shapes=problem.grid).problem
+    assert wider.library is problem.library
+    (shape,) = problem.columns([CoulombFriction(2, 0.0123)])[:1]
+    assert wider.columns([CoulombFriction(2, 0.0123)])[0] == pytest.approx(shape)
+    assert wider.grid is problem.grid
