@@ -264,10 +264,8 @@ def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
             design = problem.design(others, state.noise)
             whole = evidence(problem, state.terms, state.design, state.noise)
             own = whole - beside(problem, state, group, design)
-            joints = None
-            if all(isinstance(state.terms[i].effect, AbstractJointEffect) for i in group):
-                joints = {j for i in group for j in state.terms[i].effect.joints}
-            proposals = ranked(problem, design, state.noise, joints)
+            acts = set(np.flatnonzero(state.shares[list(group)].max(0) > _FELT).tolist())
+            proposals = ranked(problem, design, state.noise, acts)
             problem.tried.update(step.tried(free, not free and _lets_free_in(others, proposals)))
             found = choices(problem, others, design, state.noise, _new(others, proposals, free))
             if found and found[0][0] > own + BETTER:
