@@ -143,7 +143,7 @@ def test_what_is_left_of_a_link_is_a_body_in_every_start(loose):
     assert np.all(found.violation == 0)
     assert all(are_buildable(phi[1:] - CARRIED[1:]) for phi in found.phi)
     assert not all(are_buildable(phi[1:] - CARRIED[1:]) for phi in free.phi)
-    assert found.objective.min() >= free.objective.min() * (1 - 1e-6)
+    assert found.objective.min() >= free.objective.min() * (1 - 1e-6) - 1e-20  # both may be rounding alone
 
 
 def test_starts_leave_room_for_what_is_carried():
