@@ -59,24 +59,28 @@ _SETTLED = 4
 
 
 def laws(problem: Problem, log: list[str] | None = None, terms: Sequence[Term] = ()) -> State:
-    """The likeliest model of laws alone that steps from one with these terms lead to."""
-    return climb(problem, with_terms(problem, terms), _said(log), free=False)
+    """The likeliest model of laws alone that steps from one with these terms lead to.
 
-
-def search(problem: Problem, log: list[str] | None = None, state: State | None = None) -> State:
-    """The likeliest model that was found; `state`: where `laws` has ended already.
-
-    Laws come before free forms, which fit what several laws do together and hold nowhere else. Where many laws
-    are needed the arm may be one whose every joint rubs, as real ones do: another search begins at what is
-    common in every joint.
+    Where many laws are needed the arm may be one whose every joint rubs, as real ones do: other steps begin at
+    what is common in every joint.
     """
-    say, state = _said(log), laws(problem, log) if state is None else state
+    say = _said(log)
+    state = climb(problem, with_terms(problem, terms), say, free=False)
     if len(state.terms) >= _CROWDED:
         say("another beginning: what is common, at all joints")
         common = with_terms(problem, everywhere(problem, state.noise))
         other = climb(problem, common, say, free=False, met=names(state))
         if names(other) != names(state):
             state = _likelier(problem, state, other, say)
+    return state
+
+
+def search(problem: Problem, log: list[str] | None = None, state: State | None = None) -> State:
+    """The likeliest model that was found; `state`: where `laws` has ended already.
+
+    Laws come before free forms, which fit what several laws do together and hold nowhere else.
+    """
+    say, state = _said(log), laws(problem, log) if state is None else state
     say("free forms")
     return _likelier(problem, state, climb(problem, state, say), say)
 
