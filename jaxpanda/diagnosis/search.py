@@ -214,8 +214,7 @@ def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> Sta
         if step.key(free) in problem.tried:
             continue
         found, barred = instead(problem, state, i, free)
-        told = tuple((gained, tuple(t.effect.title for t in by)) for gained, by in found)
-        problem.tried.update(step.tried(free, barred, told))
+        problem.tried.update(step.tried(free, barred, _told(found)))
         own, best = next(gained for gained, terms in found if terms[0] is state.terms[i]), found[0]
         if best[0] > own + BETTER:
             if [t.key for t in best[1]] != [state.terms[i].key]:
@@ -223,6 +222,14 @@ def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> Sta
                 say(f"{said} for {name(state.terms[i])}: {best[0]:.1f} for {own:.1f}")
             state = with_terms(problem, (*state.terms[:i], *best[1], *state.terms[i + 1 :]))
     return state
+
+
+Told = Sequence[tuple[float, tuple[str, ...]]]
+"""By how much a model gets likelier with some terms, and their titles."""
+
+
+def _told(found: Sequence[Choice]) -> Told:
+    return [(gained, tuple(t.effect.title for t in terms)) for gained, terms in found]
 
 
 class Step:
@@ -241,9 +248,7 @@ class Step:
         """By the terms' identities."""
         return self.kind, free, *(tuple(sorted(map(id, some))) for some in self.terms)
 
-    def tried(
-        self, free: bool, barred: bool, found: Sequence[tuple[float, tuple[str, ...]]] = ()
-    ) -> dict[tuple, tuple["Step", Sequence[tuple[float, tuple[str, ...]]]]]:
+    def tried(self, free: bool, barred: bool, found: Told = ()) -> dict[tuple, tuple["Step", Told]]:
         """For `Problem.tried`: the step, whose terms are kept lest their identities be used again, and what was
         found; with free forms too where none of them was `barred`."""
         return {self.key(one): (self, found) for one in ({free} if barred else {free, True})}
@@ -351,9 +356,7 @@ def posterior(problem: Problem, state: State, i: int) -> dict[str, float]:
     if step.key(True) in problem.tried:
         _, found = problem.tried[step.key(True)]
     else:
-        found = [
-            (gained, tuple(t.effect.title for t in terms)) for gained, terms in instead(problem, state, i)[0]
-        ]
+        found = _told(instead(problem, state, i)[0])
     weights = np.array([0.0, *(gained for gained, _ in found)]) / TEMPERATURE
     shares_ = np.exp(weights - scipy.special.logsumexp(weights))
     out: dict[str, float] = {}
