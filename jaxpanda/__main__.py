@@ -24,7 +24,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from .convention import PLAIN, Convention
-from .errors import InputError, OutputError, printable
+from .errors import InputError, OutputError, RankError, printable
 from .model_file import WHOLE, Part
 from .reading import Reading
 
@@ -163,26 +163,27 @@ class Retrieve:
     has it. Unless told, by torque where recordings were identified."""
     processes: str = ""
     """Share the starts with other processes, here or on other machines: RANK/COUNT@HOST:PORT in each of them,
-    with ranks from 0 and HOST:PORT free on the machine of rank 0; or `auto` where a launcher such as Slurm says
-    it. Every process spreads its share over all its devices; rank 0 alone writes and prints."""
+    with ranks from 0 and HOST:PORT free on the machine of rank 0, all started within 10 s; or `auto` under
+    Slurm. Every process spreads its share over all its devices; rank 0 alone writes and prints."""
     part: _Part = WHOLE
     json: bool = False
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
-        from . import pipeline, session
+        from . import pipeline, ranks, session
 
         session.spread_over_cores()
-        session.join(self.processes)
-        return pipeline.retrieve_files(
-            self.out,
-            self.identification,
-            self.bounds,
-            self.part.of_any(self.model),
-            weighting=self.weighting,
-            starts=self.starts,
-            seed=self.seed,
-        )
+        with ranks.joined(self.processes) as together:
+            return pipeline.retrieve_files(
+                self.out,
+                self.identification,
+                self.bounds,
+                self.part.of_any(self.model),
+                weighting=self.weighting,
+                starts=self.starts,
+                seed=self.seed,
+                ranks=together,
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -699,7 +700,7 @@ def main(arguments: list[str] | None = None) -> int:
         _complain(f"interrupted; {str(stop) or 'nothing was left half-written'}")
     except BrokenPipeError:  # who read the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    except OutputError as error:
+    except (OutputError, RankError) as error:
         _complain(str(error))
     except Exception as error:
         if "JAXPANDA_TRACEBACK" in os.environ:

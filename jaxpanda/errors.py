@@ -22,6 +22,13 @@ class OutputError(Exception):
     """
 
 
+class RankError(Exception):
+    """Another process of a shared run failed; nothing is wrong with what this one was asked.
+
+    The commands print it on standard error and end with exit status 1.
+    """
+
+
 def printable(text: str) -> str:
     """The text with what steers a terminal, breaks a line or is no character written out, as `\\x1b`."""
     return "".join(

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -22,6 +21,7 @@ from .inspection import Inspection, inspect
 from .lint import lint
 from .mjcf import from_document, from_mjcf
 from .model_file import Model, ModelFile, part_of
+from .ranks import ALONE, Ranks
 from .reading import Reading
 from .recordings import Recording, content_of, distinct, load, load_many
 from .retrieval import CHECKPOINT_FILE, Retrieval, retrieve
@@ -167,8 +167,9 @@ def retrieve_files(
     weighting: Literal["auto", "torque", "none"],
     starts: int,
     seed: int,
+    ranks: Ranks = ALONE,
 ) -> Retrieval | None:
-    """`jaxpanda retrieve`, on all devices; with several processes, the first alone has something to return.
+    """`jaxpanda retrieve`, on all devices; of several ranks, the first alone has something to return.
 
     Starts are kept in `out` as they finish, until the result is there: the same command goes on from them.
     """
@@ -179,9 +180,9 @@ def retrieve_files(
         "weighting": weighting,
         "starts": starts,
         "seed": seed,
-        "devices": jax.devices(),
+        "ranks": ranks,
     }
-    if jax.process_index() > 0:
+    if ranks.rank > 0:
         retrieve(identification, **options)
         return None
     checkpoint, done = out / CHECKPOINT_FILE, 0

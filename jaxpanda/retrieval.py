@@ -35,6 +35,7 @@ from .panda import is_panda, panda
 from .parameters import coefficient_matrix
 from .posterior import FILE as POSTERIOR_FILE
 from .posterior import Posterior, named
+from .ranks import ALONE, Ranks
 
 SCHEMA = "jaxpanda.retrieval/1"
 FILE = "retrieval.json"
@@ -239,6 +240,7 @@ def retrieve(
     seed: int = 0,
     certificate: bool | Literal["auto"] = "auto",
     devices: Sequence[Device] | None = None,
+    ranks: Ranks = ALONE,
     checkpoint: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Retrieval:
@@ -267,8 +269,8 @@ def retrieve(
         starts: random starts.
         seed: same seed, same answer.
         certificate: lower bound by convex optimisation; "auto" where the extra [sdp] is installed.
-        devices: over which the starts are spread, with the same answer: all of this process when None;
-            `jax.devices()` where several processes (`jax.distributed.initialize`) make this same call.
+        devices: over which the starts are spread, with the same answer: all of this process when None.
+        ranks: processes that make this same call and share the starts (`jaxpanda.ranks.joined`).
         checkpoint: file that keeps the starts as they finish, so that an interrupted run goes on where it was
             ("smooth" penalty only). Remove it when the result is saved.
         progress: called with (starts done, starts).
@@ -290,7 +292,7 @@ def retrieve(
     A, b = _equations(table, expected, boxes.dof, weighting)
     constraints = tuple(constraints)
     carried = None if arm is None or arm.lumped is None else np.asarray(arm.lumped)
-    smooth = partial(solve, carried=carried, devices=devices, checkpoint=checkpoint)
+    smooth = partial(solve, carried=carried, devices=devices, ranks=ranks, checkpoint=checkpoint)
     run = {"smooth": smooth, "exact": exact_penalty}[penalty]
     found = run(A, b, boxes, constraints=constraints, starts=starts, seed=seed, progress=progress)
     feasible = found.violation == 0

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
-from jax.experimental import multihost_utils
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -21,8 +20,6 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.text import Text
-
-from .errors import InputError
 
 
 def start() -> None:
@@ -52,38 +49,6 @@ def spread_over_cores() -> None:
         if not forced:
             jax.config.update("jax_num_cpu_devices", devices)
         os.environ.setdefault("NPROC", str(2 * max(devices, cores)))
-
-
-def join(processes: str) -> None:
-    """Make this one of several processes that share their devices (`jax.distributed`).
-
-    Args:
-        processes: `RANK/COUNT@HOST:PORT`; "auto" where the cluster's launcher says it; "" for a process alone.
-
-    Raises:
-        InputError: malformed, or the others were not found.
-    """
-    if not processes:
-        return
-    found = re.fullmatch(r"(\d+)/(\d+)@(.+:\d+)", processes)
-    if processes != "auto" and (found is None or not int(found[1]) < int(found[2])):
-        raise InputError(
-            f"--processes {processes}: expected RANK/COUNT@HOST:PORT with RANK from 0 to COUNT - 1, such as "
-            "0/2@192.168.0.1:12345, or auto"
-        )
-    try:
-        if found is None:
-            jax.distributed.initialize()
-        else:
-            jax.distributed.initialize(found[3], int(found[2]), int(found[1]))
-        # What connects the processes reports that to file 1, where --json allows one document and nothing else.
-        sys.stdout.flush()
-        sys.stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
-        os.dup2(2, 1)
-        # They connect when they first share something, and give up after 30 s: now, not after each has compiled.
-        multihost_utils.sync_global_devices("jaxpanda")
-    except (ValueError, RuntimeError) as error:
-        raise InputError(f"--processes {processes}: the others were not found ({error})") from None
 
 
 Tick = Callable[[int, int], None]

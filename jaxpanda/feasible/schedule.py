@@ -17,10 +17,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import multihost_utils
 from jax.sharding import SingleDeviceSharding
 from jaxtyping import Array, Int, PyTree
 
+from ..ranks import ALONE, Ranks
 from .checkpoint import Checkpoint
 
 Chunk = Callable[..., PyTree[Array]]
@@ -47,6 +47,7 @@ def run(
     starts: int,
     chunk: int,
     devices: Sequence[Device] | None = None,
+    ranks: Ranks = ALONE,
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Any, float, float]:
@@ -58,23 +59,20 @@ def run(
         options: further arguments, static.
         starts: how many.
         chunk: starts solved at once on each device.
-        devices: to spread the chunks over; those of this process when None. Devices of other processes too
-            (`jax.devices()` after `jax.distributed.initialize`) where every process makes this same call: each
-            solves its share and all return everything.
-        checkpoint: kept by process 0; starts found in it are not solved again.
+        devices: to spread the chunks over; those of this process when None.
+        ranks: processes that make this same call: each solves its share and all return everything.
+        checkpoint: kept by rank 0; starts found in it are not solved again.
         progress: called with (starts done, starts) as chunks finish.
     """
-    if checkpoint is not None and jax.process_index() == 0:
+    if ranks.rank > 0:
+        checkpoint = None
+    if checkpoint is not None:
         checkpoint.require_same()
-    devices = list(jax.local_devices() if devices is None else devices)
-    mine = [device for device in devices if device.process_index == jax.process_index()]
-    processes = collections.Counter(device.process_index for device in devices)
-    shared = len(processes) > 1
-    on_cpu = devices[0].platform == "cpu"
-    if not shared:
-        worth = -(-starts // chunk) // (_WORTH if on_cpu else 1)
-        mine = mine[: max(1, worth)]
-    share = max(processes.values()) if shared else len(mine)  # chunks of a process at a time
+    mine = list(jax.local_devices() if devices is None else devices)
+    on_cpu = mine[0].platform == "cpu"
+    worth = -(-starts // chunk) // (_WORTH if on_cpu else 1) // ranks.count
+    mine = mine[: max(1, worth)]
+    share = max(int(count) for [count] in ranks.gather([np.asarray(len(mine))]))  # chunks of a rank at a time
     began = time.perf_counter()
     leaves, structure = jax.tree.flatten(problem)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
@@ -83,7 +81,7 @@ def run(
     compiled = time.perf_counter()
     rows, form = jax.tree.flatten(like)
     outcome = tuple(np.empty((starts, *one.shape[1:]), one.dtype) for one in rows)
-    done = _taken_up(checkpoint, outcome, shared)
+    done = _taken_up(checkpoint, outcome, ranks)
     if progress is not None and done:
         progress(done, starts)
 
@@ -94,8 +92,8 @@ def run(
         return [jax.tree.leaves(piece) for piece in pieces]
 
     def begin(first: int) -> list[Future[list[list[Array]]]]:
-        """This process's chunks from this start on."""
-        first += (jax.process_index() if shared else 0) * share * chunk
+        """This rank's chunks from this start on."""
+        first += ranks.rank * share * chunk
         return [hands[k % len(mine)].submit(solved, k % len(mine), first + k * chunk) for k in range(share)]
 
     def keep(first: int, pieces: list[list[Array]]) -> None:
@@ -107,20 +105,19 @@ def run(
 
     def finish(first: int, chunks: list[Future[list[list[Array]]]]) -> None:
         last = min(first + wave, starts)
-        if shared:
+        if ranks.count > 1:
             fetched = jax.device_get([piece for one in chunks for piece in one.result()])
-            together = [np.concatenate(part) for part in zip(*fetched, strict=True)]
-            everywhere = multihost_utils.process_allgather(together, tiled=True)
-            for whole, part in zip(outcome, everywhere, strict=True):
-                whole[first:last] = part[: last - first]
+            everywhere = ranks.gather([np.concatenate(part) for part in zip(*fetched, strict=True)])
+            for whole, *parts in zip(outcome, *everywhere, strict=True):
+                whole[first:last] = np.concatenate(parts)[: last - first]
         else:
             list(fetchers.map(lambda k: keep(first + k * chunk, chunks[k].result()), range(share)))
-        if checkpoint is not None and jax.process_index() == 0:
+        if checkpoint is not None:
             checkpoint.append(first, tuple(whole[first:last] for whole in outcome))
         if progress is not None:
             progress(last, starts)
 
-    wave = share * chunk * len(processes)
+    wave = share * chunk * ranks.count
     ahead = 0 if on_cpu else 1  # waves under way while one is fetched
     under_way: collections.deque[tuple[int, list[Future[list[list[Array]]]]]] = collections.deque()
     with contextlib.ExitStack() as stack:
@@ -182,13 +179,12 @@ def _program(
     return lowered.compile(), lowered.out_info[0]
 
 
-def _taken_up(checkpoint: Checkpoint | None, outcome: tuple[np.ndarray, ...], shared: bool) -> int:
+def _taken_up(checkpoint: Checkpoint | None, outcome: tuple[np.ndarray, ...], ranks: Ranks) -> int:
     """Copy what a checkpoint holds into the outcome; how many starts that is."""
-    done = 0
-    if checkpoint is not None and jax.process_index() == 0:
-        done = checkpoint.restore(outcome)
-    if shared:
-        done = int(multihost_utils.broadcast_one_to_all(np.asarray(done)))
-        for whole in outcome if done else ():
-            whole[:done] = multihost_utils.broadcast_one_to_all(whole[:done])
+    done = 0 if checkpoint is None else checkpoint.restore(outcome)
+    if ranks.count > 1:
+        finished, *rows = ranks.gather([np.asarray(done), *(whole[:done] for whole in outcome)])[0]
+        done = int(finished)
+        for whole, part in zip(outcome, rows, strict=True):
+            whole[:done] = part
     return done

@@ -11,6 +11,7 @@ one as a rule. Where few starts get there, or a box is a point, Newton steps in 
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import lsq_linear
 
 from ..errors import InputError, require_x64
+from ..ranks import ALONE, Ranks
 from . import convex, newton, projection, schedule
 from .bounds import Bounds
 from .checkpoint import Checkpoint, identity
@@ -89,6 +91,7 @@ def solve(
     rounds: int = newton.ROUNDS,
     iterations: int = newton.ITERATIONS,
     devices: Sequence[schedule.Device] | None = None,
+    ranks: Ranks = ALONE,
     checkpoint: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Solutions:
@@ -111,6 +114,7 @@ def solve(
         rounds: how often `newton` updates the constraints' multipliers.
         iterations: Newton steps a round; `convex` takes at most `rounds` times as many, and fewer as a rule.
         devices: over which the starts are spread; see `schedule.run`.
+        ranks: processes that make this same call and share the starts; all return all of them.
         checkpoint: file that keeps the starts as they finish. Where it holds starts of this same problem from a
             run that was interrupted, they are not solved again, and the answer has the same bits. The caller
             removes it.
@@ -118,7 +122,8 @@ def solve(
 
     Raises:
         InputError: shapes do not fit each other, a number is not finite, a constraint is no number, bodies
-            that are carried outweigh a bound, or the checkpoint is of another problem.
+            that are carried outweigh a bound, the checkpoint is of another problem, or ranks were given others.
+        RankError: another rank failed.
     """
     require_x64("feasible.solve")
     if starts < 1:
@@ -148,6 +153,7 @@ def solve(
             rounds,
             iterations,
             devices,
+            ranks,
             checkpoint,
             progress,
         )
@@ -174,6 +180,7 @@ def solve(
         rounds,
         iterations,
         devices,
+        ranks,
         checkpoint,
         progress,
     )
@@ -223,6 +230,7 @@ def _solve(
     rounds: int,
     iterations: int,
     devices: Sequence[schedule.Device] | None,
+    ranks: Ranks,
     checkpoint: str | Path | None,
     progress: Callable[[int, int], None] | None,
 ) -> Solutions:
@@ -250,7 +258,7 @@ def _solve(
     def go(way: _Way, starts: int, **options: Any) -> Any:
         size = way.chunk if chunk is None else chunk
         found, *spent = schedule.run(
-            way.solve_starts, way.origin, way.options, starts=starts, chunk=size, devices=devices, **options
+            *way[:3], starts=starts, chunk=size, devices=devices, ranks=ranks, **options
         )
         seconds.append(spent)
         return found
@@ -265,6 +273,9 @@ def _solve(
         """How many of a few starts converged, to an objective of no more than this."""
         return float(np.mean(tried.converged & (_objectives(A, b, tried.phi, tried.extra) <= most)))
 
+    identified = partial(identity, A, b, bounds, constraints, (*further, initial, carried), seed)
+    if ranks.count > 1:
+        ranks.require_same({"starts": str(starts), **identified((rounds, iterations, chunk or 0))})
     way, few = along_the_path() if convex.suits(bounds, extra, carried) else by_newton(), min(starts, _TRIED)
     if way.solve_starts is convex.solve_starts:
         nothing, exact = NOTHING * float(b @ b), projected(way)
@@ -275,9 +286,7 @@ def _solve(
             way = exact if share_of(go(exact, few), nothing) >= _ALMOST_ALL else way
     kept = None
     if checkpoint is not None:
-        kept = Checkpoint(
-            checkpoint, identity(A, b, bounds, constraints, (*further, initial, carried), seed, way.options)
-        )
+        kept = Checkpoint(checkpoint, identified(way.options))
     found = go(way, starts, checkpoint=kept, progress=progress)
     compile_seconds, run_seconds = np.sum(seconds, 0).tolist()
     return Solutions(
