@@ -243,10 +243,13 @@ def mounted(found: Meaning, others: Sequence[Recording], arm: Arm) -> bool:
 
 
 def _needs(reading: "_Reading") -> float:
-    """Evidence over the plain reading that one needs, by its choices: which joints, a constant each [nats]."""
+    """Evidence over the plain reading that one needs [nats], by its choices: which joints, a constant each.
+
+    Of channels out of order every joint's torque is another's, and physics that no model holds may gain in each.
+    """
     if not reading.kind:
         return 0.0
-    altered = len(_altered(reading))
+    altered = len(reading.factors) if reading.whole_order else len(_altered(reading))
     common = altered == len(reading.factors)
     usual = common and abs(float(reading.factors[0])) in _UNITS.values()
     choices = {
