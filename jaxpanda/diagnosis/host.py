@@ -1,6 +1,7 @@
 """The processor's cores, for work that is many small products."""
 
 import contextlib
+import ctypes
 import functools
 import os
 from collections.abc import Callable, Iterable
@@ -20,6 +21,7 @@ def on_host(work: Callable[P, R]) -> Callable[P, R]:
     """Decorates what makes many small products: on the processor's cores, with no threads but ours (`parallel`).
 
     BLAS's own threads would wait for each other and for ours; a GPU, for the next of a thousand small programs.
+    What such work has freed is given back when it ends.
     """
 
     @functools.wraps(work)
@@ -29,9 +31,21 @@ def on_host(work: Callable[P, R]) -> Callable[P, R]:
             if jax.default_backend() != "cpu":
                 with contextlib.suppress(RuntimeError):  # JAX_PLATFORMS leaves the processor out
                     stack.enter_context(jax.default_device(jax.local_devices(backend="cpu")[0]))
-            return work(*args, **kwargs)
+            try:
+                return work(*args, **kwargs)
+            finally:
+                _return_freed()
 
     return alone
+
+
+def _return_freed() -> None:
+    """Hand memory that is free back to the system, which glibc does not by itself once it lies in pieces.
+
+    A process that diagnosed again and again held 2.4 GB, of which 0.6 were in use.
+    """
+    with contextlib.suppress(AttributeError, OSError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def parallel(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
