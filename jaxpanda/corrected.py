@@ -285,6 +285,8 @@ def _check_numbers(found: Corrected, noise: np.ndarray) -> None:
             raise ValueError(f"{name} must hold {' x '.join(map(str, shape))} numbers")
     if len(found.cutoffs) not in (0, n) or not all(x is None or 0 < x < np.inf for x in found.cutoffs):
         raise ValueError(f"cutoffs must hold {n} positive numbers")
+    if found.turning is not None and not 0 < found.turning < np.inf:
+        raise ValueError("turning must be a positive number")
 
 
 class Plant(eqx.Module):

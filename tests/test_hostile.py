@@ -281,7 +281,7 @@ def test_a_few_mutated_inputs_of_a_format_are_read_or_refused(format):
     "format",
     [
         *("csv.gz", "npz", "parquet", "raw_logs", "mat", "h5", "mcap", "db3", "lerobot"),
-        *("mjcf", "table", "corrected", "mass_gravity"),
+        *("mjcf", "urdf", "table", "corrected", "bounds", "mass_gravity"),
     ],
 )
 def test_many_mutated_inputs_of_a_format_are_read_or_refused(format):

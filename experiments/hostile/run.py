@@ -1,6 +1,6 @@
 """Mutated inputs of every format, and what becomes of them: accepted, refused in a sentence, or a defect.
 
-    python experiments/hostile/run.py --seed 1 --count 200 [--format csv mjcf ...] [--kills 20]
+    python experiments/hostile/run.py --seed 1 --count 200 [--format csv mjcf ...]
 
 Each format has a process of its own with a limit on its memory, so that a crash or a hang counts as what it is.
 """
@@ -12,7 +12,6 @@ import json
 import random
 import resource
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -117,6 +116,12 @@ def attempt(action: Callable[[], Any]) -> tuple[str, str]:
     return kind, said
 
 
+def thinned(log: Any) -> Any:
+    """Every tenth sample of a recording."""
+    channels = {name: getattr(log, name)[::10] for name in ("time", "q", "qd", "tau")}
+    return dataclasses.replace(log, **channels)
+
+
 def material(folder: Path) -> dict[str, Path]:
     """A small valid input of each format."""
     import jax.numpy as jnp
@@ -124,13 +129,12 @@ def material(folder: Path) -> dict[str, Path]:
     import jaxpanda
     from jaxpanda.demo import record
     from jaxpanda.export import panda_mjcf
+    from jaxpanda.feasible import Bounds
     from jaxpanda.files import write_json, write_npz, write_text
     from jaxpanda.recordings import save
+    from jaxpanda.urdf import to_urdf
 
-    log = record(seed=3, duration=2.0).recording
-    short = dataclasses.replace(
-        log, **{name: getattr(log, name)[::10] for name in ("time", "q", "qd", "tau")}
-    )
+    short = thinned(record(seed=3, duration=2.0).recording)
     out = {name: folder / f"arm.{name}" for name in ("csv", "csv.gz", "npz", "parquet")}
     for path in out.values():
         save(short, path)
@@ -152,6 +156,11 @@ def material(folder: Path) -> dict[str, Path]:
         out["table"],
         {"schema": "jaxpanda.identification/1", "coefficients": rows, "links": list(arm.link_names)},
     )
+    out["urdf"] = folder / "arm.urdf"
+    write_text(out["urdf"], to_urdf(arm))
+    out["bounds"] = folder / "bounds.csv"
+    rows = [",".join(map(str, (name, *box))) for name, box in Bounds.panda().boxes()]
+    write_text(out["bounds"], "\n".join(["name,lower,upper", *rows]) + "\n")
     out["mass_gravity"] = folder / "mg.npz"
     write_npz(out["mass_gravity"], {"q": short.q[:20], "g": short.q[:20]})
     return out
@@ -213,6 +222,7 @@ def reader(format: str) -> Callable[[Path], Any]:
     from jaxpanda import corrected, recordings
     from jaxpanda.demo import record
     from jaxpanda.diagnosis import predict
+    from jaxpanda.feasible import Bounds
     from jaxpanda.files import to_json
     from jaxpanda.identification import Identification, load_mass_gravity
     from jaxpanda.mjcf import from_mjcf
@@ -232,7 +242,8 @@ def reader(format: str) -> Callable[[Path], Any]:
         if format == "corrected":
             predict(path.parent, motion)
 
-    readers = {"mjcf": from_mjcf, "corrected": result, "table": result, "mass_gravity": load_mass_gravity}
+    readers = {"mjcf": from_mjcf, "urdf": from_mjcf, "corrected": result, "table": result}
+    readers |= {"mass_gravity": load_mass_gravity, "bounds": Bounds.from_csv}
     return readers.get(format, recording)
 
 
@@ -274,39 +285,7 @@ def work(format: str, seed: int, count: int) -> dict[str, Any]:
 
 
 RECORDINGS = ("csv", "csv.gz", "npz", "parquet", "raw_logs", "mat", "h5", "mcap", "db3", "lerobot")
-FORMATS = (*RECORDINGS, "mjcf", "corrected", "table", "mass_gravity")
-
-
-def kills(seed: int, count: int) -> dict[str, int]:
-    """`identify` over an earlier result, killed at random times: the old set, or the whole new one."""
-    rng, found = random.Random(seed), Counter()
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        material(folder)
-        out, command = folder / "out", [sys.executable, "-m", "jaxpanda", "identify", "--folds", "0", "--out"]
-        command += [str(out), "--recording", str(folder / "arm.csv")]
-        began = time.monotonic()
-        subprocess.run(command, check=True, capture_output=True)
-        lasts = time.monotonic() - began
-        for _ in range(count):
-            with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as child:
-                time.sleep(rng.uniform(0.5, 1.0) * lasts)
-                child.send_signal(rng.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT]))
-            found["scratch left"] += sum(path.name.startswith(".jaxpanda.") for path in out.iterdir())
-            found["whole" if whole(out) else "half-written"] += 1
-        subprocess.run(command, check=True, capture_output=True)
-        found["scratch left at the end"] = sum(path.name.startswith(".jaxpanda.") for path in out.iterdir())
-    return dict(found)
-
-
-def whole(out: Path) -> bool:
-    """Whether a set is one run's, by its own list."""
-    from jaxpanda.files import settle
-    from jaxpanda.inputs import digest
-
-    settle(out)
-    listed = json.loads((out / "identification.json").read_text())["run"]["files"]
-    return all(digest(out / name) == value for name, value in listed.items())
+FORMATS = (*RECORDINGS, "mjcf", "urdf", "corrected", "table", "bounds", "mass_gravity")
 
 
 def main() -> int:
@@ -314,7 +293,6 @@ def main() -> int:
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--count", type=int, default=200, help="of each format")
     options.add_argument("--format", nargs="*", default=FORMATS, choices=FORMATS)
-    options.add_argument("--kills", type=int, default=0)
     options.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     given = options.parse_args()
     if given.worker:
@@ -348,8 +326,6 @@ def main() -> int:
         )
         for example, number in one["examples"].items():
             print(f"<!-- {format}, {number}: {example} -->", file=sys.stderr)
-    if given.kills:
-        print(f"\nkilled runs of `identify` over an earlier result: {kills(given.seed, given.kills)}")
     return int(bad > 0)
 
 

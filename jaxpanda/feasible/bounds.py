@@ -159,7 +159,9 @@ def _read_table(path: Path) -> dict[str, tuple[float, float]]:
     table: dict[str, tuple[float, float]] = {}
     for number, row in enumerate(reader, start=2):
         name = (row["name"] or "").strip()
-        if not re.fullmatch(r"m\d+|c\d+[xyz]|I\d+(xx|yy|zz|xy|xz|yz)|total_mass", name):
+        if not re.fullmatch(
+            r"(m@|c@[xyz]|I@(xx|yy|zz|xy|xz|yz)|total_mass)".replace("@", r"[1-9]\d{0,2}"), name
+        ):
             raise InputError(
                 f"{path}: row {number}, column name: '{name}' is none of m1, c1x, I1xx, total_mass"
             )

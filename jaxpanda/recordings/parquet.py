@@ -71,7 +71,7 @@ def _telling(name: str) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (OSError, LookupError, arrow.ArrowException) as error:
+    except (OSError, LookupError, UnicodeDecodeError, arrow.ArrowException) as error:
         said = " ".join(str(error).split())[:200]
         raise InputError(f"{name}: no Parquet file, or a broken one ({said})") from None
 
