@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxpanda import diagnosis, session
+from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.diagnosis import page
-from jaxpanda.export import panda_mjcf
 from jaxpanda.simulation import JointFriction, panda_sensors, random_trajectory, simulate
 
 

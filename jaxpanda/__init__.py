@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     __version__: str
-    from .arm import Arm as Arm
+    from .arms.arm import Arm as Arm
+    from .arms.model_file import ModelFile as ModelFile
+    from .arms.model_file import Part as Part
     from .comparison import Comparison as Comparison
     from .comparison import compare as compare
     from .corrected import Corrected as Corrected
@@ -33,8 +35,6 @@ if TYPE_CHECKING:
     from .identification import identify as identify
     from .identification import identify_mass_gravity as identify_mass_gravity
     from .inspection import inspect as inspect
-    from .model_file import ModelFile as ModelFile
-    from .model_file import Part as Part
     from .payload import estimate_payload as estimate_payload
     from .pipeline import to_mjcf as to_mjcf
     from .reading import Reading as Reading
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from .validation import validate as validate
 
 _HOME = {
-    "Arm": "arm",
+    "Arm": "arms.arm",
     "Bounds": "feasible",
     "Comparison": "comparison",
     "Corrected": "corrected",
@@ -59,8 +59,8 @@ _HOME = {
     "Ensemble": "ensemble",
     "Identification": "identification",
     "InputError": "errors",
-    "ModelFile": "model_file",
-    "Part": "model_file",
+    "ModelFile": "arms.model_file",
+    "Part": "arms.model_file",
     "Reading": "reading",
     "Recording": "recordings",
     "Rehearsal": "rehearsal",

@@ -23,9 +23,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from .arms.model_file import WHOLE, Part
 from .convention import PLAIN, Convention
 from .errors import InputError, OutputError, RankError, printable
-from .model_file import WHOLE, Part
 from .reading import Reading
 
 # Before numpy is imported: its matrices are small here, and threads on them cost more than they save (a
@@ -77,8 +77,10 @@ class Demo:
 class Inspect:
     """What is in a recording: channels, rate, gaps, units, signs, noise, and what it can identify."""
 
-    recording: tuple[Path, ...]
+    file: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Recordings to look at."""
+    recording: tuple[Path, ...] = ()
+    """The same, as an option."""
     model: Path | None = None
     """The arm (MJCF or URDF); without it, the project's own Panda."""
     read: _Read = dataclasses.field(default_factory=Reading)
@@ -90,9 +92,10 @@ class Inspect:
     def run(self) -> Any:
         from . import pipeline
 
-        return pipeline.inspect_files(
-            self.recording, self.part.of_any(self.model), self.read, self.convention
-        )
+        files = (*self.file, *self.recording)
+        if not files:
+            raise InputError("inspect needs a FILE; see jaxpanda inspect --help")
+        return pipeline.inspect_files(files, self.part.of_any(self.model), self.read, self.convention)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,11 +9,11 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from .arms.model_file import Model
 from .errors import InputError
-from .model_file import Model
 
 if TYPE_CHECKING:
-    from .arm import Arm
+    from .arms.arm import Arm
     from .recordings import Recording
 
 UNITS = {
@@ -102,7 +102,7 @@ class Convention:
         """
         if self == PLAIN:
             return list(recordings)
-        from .arm import Arm
+        from .arms.arm import Arm
 
         arm = None
         if self.removed:

@@ -14,7 +14,7 @@ from jaxpanda_kernels import Chain
 from jaxtyping import Array, Float
 
 from . import files
-from .arm import FRICTION_LAW, NUMBERS, Arm, numbers
+from .arms.arm import FRICTION_LAW, NUMBERS, Arm, numbers
 from .effects import (
     AbstractEffect,
     AbstractJointEffect,

@@ -12,15 +12,16 @@ import numpy as np
 from jaxtyping import Float
 
 from . import report, summaries
+from .arms.export import panda_mjcf
+from .arms.mjcf import standard_from_com
+from .arms.model_file import Model, ModelFile, part_of
+from .arms.panda import published
+from .arms.source import from_mjcf
 from .convention import PLAIN, Convention
 from .errors import InputError, require_x64
-from .export import panda_mjcf
 from .files import Kind, output_folder
 from .identification import Identification, identify
 from .inspection import inspect
-from .mjcf import from_mjcf, standard_from_com
-from .model_file import Model, ModelFile, part_of
-from .panda import published
 from .pipeline import arm_of, beyond_mjcf, recordings_of, to_mjcf
 from .reading import Reading
 from .recordings import Recording, save

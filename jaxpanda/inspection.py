@@ -9,7 +9,7 @@ import numpy as np
 from jaxpanda_kernels import regressor
 from jaxtyping import Float, Int
 
-from .arm import Arm, unit_of
+from .arms.arm import Arm, unit_of
 from .errors import require_x64
 from .meaning import Meaning, meaning
 from .recordings import Origin, Recording

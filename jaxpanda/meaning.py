@@ -31,7 +31,7 @@ from jaxpanda_kernels import regressor
 from jaxtyping import Float, Int
 from threadpoolctl import threadpool_limits
 
-from .arm import Arm
+from .arms.arm import Arm
 from .convention import REMOVED, UNITS
 from .recordings import Recording
 from .signals import prepare

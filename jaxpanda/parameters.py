@@ -22,7 +22,7 @@ import numpy as np
 from jaxpanda_kernels import Chain, regressor
 from jaxtyping import Float
 
-from .arm import Arm
+from .arms.arm import Arm
 from .errors import InputError, require_x64
 
 # Names of the ten parameters of link {0}, in the order of `jaxpanda_kernels.inertia`.

@@ -8,26 +8,27 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from . import inputs, markup
-from .arm import Arm
+from . import inputs
+from .arms import markup
+from .arms.arm import Arm
+from .arms.export import Change, panda_mjcf, read_sidecar, sidecar_of, write_parameters
+from .arms.lint import lint
+from .arms.model_file import Model, ModelFile, part_of
+from .arms.source import from_document, from_mjcf
+from .arms.urdf import MARK, left_out, to_urdf
 from .convention import PLAIN, Convention
 from .errors import InputError
-from .export import Change, panda_mjcf, read_sidecar, sidecar_of, write_parameters
 from .files import output_file, output_folder, remove, write_bytes, write_text
 from .friction import Friction
 from .identification import Identification, identify, identify_mass_gravity
 from .identification.result import KIND as IDENTIFICATION
 from .inspection import Inspection, inspect
-from .lint import lint
-from .mjcf import from_document, from_mjcf
-from .model_file import Model, ModelFile, part_of
 from .ranks import ALONE, Ranks
 from .reading import Reading
 from .recordings import Recording, content_of, distinct, load, load_many
 from .retrieval import CHECKPOINT_FILE, Retrieval, retrieve
 from .retrieval import KIND as RETRIEVAL
 from .session import progress, telling
-from .urdf import MARK, left_out, to_urdf
 from .validation import KIND as VALIDATION
 from .validation import Validation, validate
 

@@ -13,7 +13,9 @@ import numpy as np
 from jaxpanda_kernels import inertia
 from jaxtyping import Bool, Float
 
-from .arm import Arm
+from .arms.arm import Arm
+from .arms.model_file import WHOLE, Part
+from .arms.source import is_panda
 from .certificate import lower_bound
 from .errors import InputError
 from .feasible import Bounds, Constraint, Links, Solutions, exact_penalty, solve
@@ -30,8 +32,6 @@ from .identification.one_step import Prior
 from .identification.result import known_physics
 from .identification.statistics import samples_as_one
 from .inputs import read_json, read_npz
-from .model_file import WHOLE, Part
-from .panda import is_panda, panda
 from .parameters import coefficient_matrix
 from .posterior import FILE as POSTERIOR_FILE
 from .posterior import Posterior, named
@@ -465,7 +465,7 @@ def _identified(identification: Identification | Mapping[str, Any] | str | Path)
 
 def _arm(table: Identification) -> Arm | None:
     """The arm that was identified; the Panda where nothing says otherwise."""
-    return table.model or (panda() if table.arm in ("", "panda") and table.dof <= 7 else None)
+    return table.model or (Arm.panda() if table.arm in ("", "panda") and table.dof <= 7 else None)
 
 
 def _bounds(bounds: Bounds | str | Path | None, arm: Arm | None, table: Identification) -> Bounds:

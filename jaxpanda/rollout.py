@@ -34,22 +34,21 @@ import numpy as np
 import scipy.interpolate
 from jaxtyping import Array, Float
 
-from .arm import Arm
-from .corrected import XML, Corrected, Plant, read
-from .effects import AbstractEffect, masses, slopes
-from .errors import InputError, require_x64
-from .export import dry_friction
-from .mjcf import (
+from .arms.arm import Arm
+from .arms.export import dry_friction
+from .arms.mjcf import (
     MjcfSource,
     com_from_standard,
-    file_with,
-    from_mjcf,
     has_own_friction_law,
     move_standard,
     own_log,
     standard_from_com,
 )
-from .model_file import Model
+from .arms.model_file import Model
+from .arms.source import file_with, from_mjcf
+from .corrected import XML, Corrected, Plant, read
+from .effects import AbstractEffect, masses, slopes
+from .errors import InputError, require_x64
 from .recordings import Recording
 from .recordings import load as load_recording
 from .signals import derivatives, prepare, zero_phase

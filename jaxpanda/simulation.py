@@ -380,7 +380,9 @@ class _Tracking:
         """
         steepest = self.friction.viscous + np.abs(self.friction.coulomb) / self.friction.width
         slope = self.damping + np.diag(np.broadcast_to(steepest, self.model.nv))
-        poses = self.trajectory(np.linspace(0, 2 * np.pi / self.trajectory.w, 20))[0]
+        poses = self.trajectory(np.linspace(0, 2 * np.pi / self.trajectory.w, 500))[
+            0
+        ]  # some are passed quickly
         rates = [np.linalg.eigvals(np.linalg.solve(self._mass_matrix(q), slope)) for q in poses]
         return int(np.ceil(interval * np.abs(rates).max() / 2))
 

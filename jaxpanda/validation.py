@@ -31,12 +31,13 @@ import scipy.interpolate
 from jaxtyping import Array, Float
 
 from . import files
-from .arm import Arm
-from .engine_log import own_log
+from .arms.arm import Arm
+from .arms.engine_log import own_log
+from .arms.mjcf import MjcfSource
+from .arms.model_file import Model
+from .arms.source import from_mjcf
 from .errors import InputError, require_x64
 from .friction import Friction
-from .mjcf import MjcfSource, from_mjcf
-from .model_file import Model
 from .recordings import Recording
 from .signals import Signals, derivatives, prepare, zero_phase
 
@@ -291,7 +292,9 @@ def arm_model(source: MjcfSource) -> mujoco.MjModel:
     spec.compiler.degree = False
     spec.compiler.autolimits = False
     spec.compiler.fusestatic = False
-    joints = {link.body_id: link.joint_id for link in source.links}
+    joints: dict[int, list[int]] = {}  # a body may have several
+    for link in source.links:
+        joints.setdefault(link.body_id, []).append(link.joint_id)
     root = int(full.body_rootid[source.links[0].body_id])
     made = {0: spec.worldbody}
     for i in range(1, full.nbody):
@@ -307,8 +310,8 @@ def arm_model(source: MjcfSource) -> mujoco.MjModel:
             iquat=full.body_iquat[i],
             inertia=full.body_inertia[i],
         )
-        if i in joints:
-            _add_joint(body, full, joints[i])
+        for joint in joints.get(i, []):
+            _add_joint(body, full, joint)
     bare = spec.compile()
     _copy_options(full, bare)
     return bare

@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from jaxpanda.mjcf import MjcfSource
+from jaxpanda.arms.mjcf import MjcfSource
 
 MODELS = Path(__file__).parent / "models"
 FILES = sorted(MODELS.glob("*.xml"))

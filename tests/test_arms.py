@@ -9,12 +9,13 @@ from jaxpanda_kernels import rnea
 from mjcf_cases import chain_of, mujoco_torque, random_states
 
 from jaxpanda.__main__ import main
+from jaxpanda.arms.export import write_parameters
+from jaxpanda.arms.lint import lint
+from jaxpanda.arms.model_file import ModelFile, Part
+from jaxpanda.arms.source import file_with, from_mjcf
+from jaxpanda.arms.urdf import to_urdf
 from jaxpanda.errors import InputError
-from jaxpanda.export import write_parameters
-from jaxpanda.lint import lint
-from jaxpanda.mjcf import file_with, from_mjcf
-from jaxpanda.model_file import ModelFile, Part
-from jaxpanda.urdf import to_urdf
+from jaxpanda.validation import arm_model
 
 
 def written(tmp_path, text, name="arm.xml"):
@@ -116,6 +117,7 @@ def test_joints_of_one_body_have_links_without_mass_between_them(tmp_path):
     assert arm.link_names == ("one", "two/x", "two")
     assert not np.any(arm.standard[1])
     assert_torques_are_mujocos(arm, source)
+    assert [arm_model(source).joint(i).name for i in range(3)] == ["first", "x", "y"]
     lighter = np.asarray(arm.standard) * 0.9
     result = write_parameters(
         source, arm.__class__.from_json({**arm.to_json(), "damping": [0, 0, 0.3]}), lighter

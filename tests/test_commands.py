@@ -335,7 +335,7 @@ def test_a_line_of_the_log_is_told_in_words(line, told):
         (["--verion"], "no command '--verion' (did you mean --version?)"),
         (["demo", "--out"], "--out has no value after it"),
         (["demo", "--out", "a", "b"], "demo: no option takes 'b'"),
-        (["inspect", "a.csv"], "inspect: no option takes 'a.csv', and --recording must be given"),
+        (["identify", "a.csv"], "identify: no option takes 'a.csv', and --out must be given"),
         (["inspect", "-recording", "a.csv"], "inspect has no option -recording (did you mean --recording?)"),
         (["predict", "--diagnosis", "a", "--recording", "b", "c", "--out", "d"], "no option takes 'c'"),
         (["demo", "--out", "d", "--json=true"], "demo: no option takes 'true'"),
@@ -425,7 +425,7 @@ def test_long_names_of_rows_give_way_to_their_numbers(capsys):
 
 
 def test_an_export_s_table_has_six_digits_and_its_json_all():
-    from jaxpanda.export import Change
+    from jaxpanda.arms.export import Change
     from jaxpanda.pipeline import Export
     from jaxpanda.summaries import of
 

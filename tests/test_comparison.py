@@ -11,8 +11,8 @@ from test_excitation import ARM
 
 from jaxpanda import InputError, compare, identify
 from jaxpanda.__main__ import main
+from jaxpanda.arms.source import from_mjcf
 from jaxpanda.comparison.compare import holm, overall
-from jaxpanda.mjcf import from_mjcf
 from jaxpanda.simulation import JointFriction, Sensors, perturbed, random_trajectory, simulate
 
 FRICTION = JointFriction(viscous=np.full(3, 0.5), coulomb=np.full(3, 0.3), offset=0.1)

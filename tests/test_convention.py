@@ -9,10 +9,11 @@ from helpers import record
 
 from jaxpanda import Recording
 from jaxpanda.__main__ import main
+from jaxpanda.arms.markup import parse
+from jaxpanda.arms.mjcf import with_gravity
+from jaxpanda.arms.source import from_document, from_mjcf
 from jaxpanda.convention import PLAIN, Convention
 from jaxpanda.errors import InputError
-from jaxpanda.markup import parse
-from jaxpanda.mjcf import from_document, from_mjcf, with_gravity
 from jaxpanda.recordings import save
 
 

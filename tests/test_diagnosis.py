@@ -17,7 +17,10 @@ import pytest
 from helpers import NOISE, excitation, record
 from helpers import result as held
 
-from jaxpanda import Arm, InputError, Recording, markup
+from jaxpanda import Arm, InputError, Recording
+from jaxpanda.arms import markup
+from jaxpanda.arms.export import panda_mjcf
+from jaxpanda.arms.source import from_document
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
 from jaxpanda.diagnosis.credible import is_event
@@ -39,10 +42,8 @@ from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.motion import masses
 from jaxpanda.effects.sensing import TorqueCrosstalk, TorqueOffset
 from jaxpanda.effects.stribeck import StribeckFriction
-from jaxpanda.export import panda_mjcf
 from jaxpanda.feasible.nearest import are_buildable
 from jaxpanda.files import write_json
-from jaxpanda.mjcf import from_document
 from jaxpanda.report import to_html
 
 

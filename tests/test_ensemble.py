@@ -15,9 +15,9 @@ from test_excitation import ARM
 
 from jaxpanda import Arm, Ensemble, InputError, Retrieval, draw_ensemble, identify, retrieve
 from jaxpanda.__main__ import main
+from jaxpanda.arms.source import from_mjcf
 from jaxpanda.ensemble import sampler
 from jaxpanda.feasible import Bounds
-from jaxpanda.mjcf import from_mjcf
 from jaxpanda.posterior import Posterior
 from jaxpanda.signals import prepare
 from jaxpanda.simulation import JointFriction, Sensors, perturbed, random_trajectory, simulate

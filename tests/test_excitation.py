@@ -14,6 +14,7 @@ from jaxpanda_kernels import regressor
 
 from jaxpanda import Arm
 from jaxpanda.__main__ import main
+from jaxpanda.arms.source import from_mjcf
 from jaxpanda.errors import InputError
 from jaxpanda.excitation import excite
 from jaxpanda.excitation.design import Fourier, Problem, Task, starts
@@ -22,7 +23,6 @@ from jaxpanda.excitation.limits import is_franka_panda, limits_of
 from jaxpanda.excitation.scene import probes_of, scene_of
 from jaxpanda.files import write_json
 from jaxpanda.identification import identify
-from jaxpanda.mjcf import from_mjcf
 from jaxpanda.parameters import arm_base_parameters
 from jaxpanda.recordings import load, save
 from jaxpanda.simulation import FourierTrajectory, JointFriction, Sensors, random_trajectory, simulate

@@ -16,13 +16,15 @@ import pytest
 from jaxpanda_kernels import rnea
 from mjcf_cases import CASES, FILES, MODELS, chain_of, mujoco_torque, random_states
 
-from jaxpanda import export, markup
+from jaxpanda.arms import export, markup
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.export import edit_mjcf, not_held, panda_mjcf, sidecar, write_parameters
+from jaxpanda.arms.mjcf import standard_from_com
+from jaxpanda.arms.panda import published
+from jaxpanda.arms.source import from_document, from_mjcf
+from jaxpanda.arms.urdf import to_urdf
 from jaxpanda.errors import InputError
-from jaxpanda.export import edit_mjcf, not_held, panda_mjcf, sidecar, write_parameters
 from jaxpanda.friction import Friction
-from jaxpanda.mjcf import from_document, from_mjcf, standard_from_com
-from jaxpanda.panda import panda, published
-from jaxpanda.urdf import to_urdf
 
 WRITTEN = ("pos", "mass", "fullinertia", "damping", "frictionloss", "solreffriction", "solimpfriction")
 REPLACED = ("diaginertia", "quat", "axisangle", "euler")
@@ -165,7 +167,7 @@ def test_what_mujoco_cannot_hold_goes_into_the_sidecar(tmp_path):
 
 
 def test_a_sigmoid_is_written_as_its_level_at_speed_and_its_offset_kept():
-    arm = panda()
+    arm = Arm.panda()
     values = published()["sigmoid_friction"]
     friction = Friction("sigmoid", {name: np.array(values[name]) for name in ("phi1", "phi2", "phi3")})
     model = mujoco.MjModel.from_xml_string(panda_mjcf(friction=friction))
@@ -177,7 +179,7 @@ def test_a_sigmoid_is_written_as_its_level_at_speed_and_its_offset_kept():
 
 def test_the_arm_that_was_identified_decides_the_rest_of_the_joints():
     _, source = from_mjcf(MODELS / "menagerie_like.xml")
-    other = dataclasses.replace(panda(), armature=jnp.full(7, 0.02))
+    other = dataclasses.replace(Arm.panda(), armature=jnp.full(7, 0.02))
     written = from_document(write_parameters(source, other).document)[0]
     np.testing.assert_array_equal(written.armature, np.full(7, 0.02))
     np.testing.assert_array_equal(written.damping, np.zeros(7))
@@ -202,9 +204,9 @@ def test_an_export_has_all_digits_where_jax_has_float32():
 
 def test_an_arm_of_another_geometry_is_refused():
     _, source = from_mjcf(MODELS / "dm_like.xml")
-    moved = eqx.tree_at(lambda a: a.chain.p, panda(), panda().chain.p.at[3, 0].add(0.01))
+    moved = eqx.tree_at(lambda a: a.chain.p, Arm.panda(), Arm.panda().chain.p.at[3, 0].add(0.01))
     with pytest.raises(InputError, match="its joint axes stand elsewhere"):
-        write_parameters(source, moved, panda().standard)
+        write_parameters(source, moved, Arm.panda().standard)
     short = from_mjcf(MODELS / "including.xml")[0]
     with pytest.raises(InputError, match="has 7 arm joints, the parameters are for 3"):
         write_parameters(source, short)
@@ -316,13 +318,13 @@ def test_the_own_panda_is_the_published_one():
     document = markup.parse(panda_mjcf(), "mujoco", MODELS / "panda.xml")
     arm, source = from_document(document)
     q, qd, qdd = random_states(source)
-    ours = jax.vmap(panda().inverse_dynamics)(*map(jnp.asarray, (q, qd, qdd)))
+    ours = jax.vmap(Arm.panda().inverse_dynamics)(*map(jnp.asarray, (q, qd, qdd)))
     np.testing.assert_allclose(mujoco_torque(source, q, qd, qdd), ours, rtol=0, atol=1e-11)
-    assert arm.joint_names == panda().joint_names
+    assert arm.joint_names == Arm.panda().joint_names
 
 
 def test_the_own_panda_refuses_what_is_no_body():
-    phi = panda().standard.at[3, 0].set(-1.0)
+    phi = Arm.panda().standard.at[3, 0].set(-1.0)
     with pytest.raises(InputError, match="panda: body 'link4' would weigh -1 kg"):
         panda_mjcf(phi)
 
@@ -370,7 +372,7 @@ def test_the_own_panda_runs_in_mjx():
     qd, qdd = rng.uniform(-1, 1, (2, 7))
     data = mjx.make_data(model).replace(qpos=jnp.asarray(q), qvel=jnp.asarray(qd), qacc=jnp.asarray(qdd))
     torque = jax.jit(lambda data: mjx.inverse(mjx.put_model(model), data).qfrc_inverse)(data)
-    ours = panda().inverse_dynamics(*map(jnp.asarray, (q, qd, qdd)))
+    ours = Arm.panda().inverse_dynamics(*map(jnp.asarray, (q, qd, qdd)))
     np.testing.assert_allclose(torque, ours, atol=1e-10)
 
 
@@ -398,7 +400,7 @@ def test_pinocchio_reads_the_urdf_as_the_same_arm(path):
 def test_roll_pitch_yaw_give_the_rotation_back_even_where_two_of_them_are_one(pitch):
     from scipy.spatial.transform import Rotation
 
-    from jaxpanda.urdf import roll_pitch_yaw
+    from jaxpanda.arms.urdf import roll_pitch_yaw
 
     R = Rotation.from_euler("ZYX", [0.4, pitch, -1.1]).as_matrix()
     roll, pitch, yaw = roll_pitch_yaw(R)

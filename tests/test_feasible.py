@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from jaxpanda_kernels import inertia
 
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.panda import published
 from jaxpanda.certificate import lower_bound
 from jaxpanda.errors import InputError
 from jaxpanda.feasible import (
@@ -26,7 +28,6 @@ from jaxpanda.feasible import (
 from jaxpanda.feasible.convex import scaled_problem, solve_chunk, starting_points
 from jaxpanda.feasible.nearest import nearest_buildable
 from jaxpanda.feasible.outcome import XYZ_COLUMN, XYZ_ROW
-from jaxpanda.panda import panda, published
 from jaxpanda.parameters import coefficient_matrix, random_regressor
 
 
@@ -88,7 +89,7 @@ def test_a_reachable_right_hand_side_is_reached_from_most_starts(reachable):
 def test_what_links_of_the_panda_have_is_met_by_nearly_all_starts_each_in_its_own_way():
     """41 coefficients of 70 parameters: the exact solutions are a space of 29 dimensions, boxes allowing."""
     A, _, bounds = published_problem()
-    b = A @ np.asarray(panda().standard).ravel()
+    b = A @ np.asarray(Arm.panda().standard).ravel()
     found = solve(A, b, bounds, starts=128)
     met = (found.violation == 0) & (found.objective <= 1e-14 * b @ b)
     assert np.mean(met) > 0.95
@@ -101,7 +102,7 @@ def test_what_links_of_the_panda_have_is_met_by_nearly_all_starts_each_in_its_ow
 
 def test_where_boxes_on_inertias_bind_exact_coefficients_are_met_all_the_same():
     A, _, bounds = published_problem()
-    truth = panda()
+    truth = Arm.panda()
     boxes = np.asarray(jax.vmap(inertia.to_com)(truth.standard)[2])[:, XYZ_ROW, XYZ_COLUMN]
     width = 0.3 * np.abs(boxes).max(1, keepdims=True)
     tight = dataclasses.replace(bounds, inertia=np.stack([boxes - width, boxes + width], -1))
@@ -242,7 +243,7 @@ def test_the_published_bounds_are_read_with_their_total_mass():
 
 
 def test_bounds_around_an_arm_hold_that_arm():
-    arm = panda()
+    arm = Arm.panda()
     bounds = Bounds.around(arm)
     mass, com, I_com = jax.vmap(inertia.to_com)(arm.standard)
     six = I_com[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
@@ -429,7 +430,7 @@ def test_links_much_larger_than_the_box_of_their_centre_of_mass_are_found(width,
 
 def test_the_nearest_links_that_can_be_built_give_the_torque_of_those_that_cannot():
     """What the torque does not show makes link 7 impossible, and is taken off; what it shows stays."""
-    arm = panda()
+    arm = Arm.panda()
     W = np.asarray(random_regressor(arm, 300)).reshape(-1, 70) / 0.05
     _, root = np.linalg.qr(W)
     begin = np.asarray(arm.standard)
@@ -454,7 +455,7 @@ def test_the_nearest_links_that_can_be_built_give_the_torque_of_those_that_canno
 
 
 def test_of_links_that_carry_others_only_their_own_part_moves():
-    arm = panda()
+    arm = Arm.panda()
     _, root = np.linalg.qr(np.asarray(random_regressor(arm, 100)).reshape(-1, 70) / 0.05)
     begin, carried = np.asarray(arm.standard), np.zeros((7, 10))
     carried[6] = 0.5 * begin[6]

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxpanda.arms.panda import published
 from jaxpanda.errors import InputError
 from jaxpanda.friction import LINEAR, MODELS, Friction, columns, sigmoid
-from jaxpanda.panda import published
 
 
 def drawn(model: str, dof: int = 3) -> Friction:

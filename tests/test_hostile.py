@@ -22,11 +22,11 @@ from test_commands import MODELS, refused, shaken
 import jaxpanda
 from jaxpanda import report
 from jaxpanda.__main__ import main
+from jaxpanda.arms.export import write_document
+from jaxpanda.arms.model_file import ModelFile, Part
+from jaxpanda.arms.source import from_mjcf
 from jaxpanda.errors import InputError
-from jaxpanda.export import write_document
 from jaxpanda.files import write_json
-from jaxpanda.mjcf import from_mjcf
-from jaxpanda.model_file import ModelFile, Part
 from jaxpanda.recordings import load, save
 
 ARM = '<body><joint axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'

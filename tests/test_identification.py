@@ -14,7 +14,8 @@ import scipy.signal
 from helpers import random_bodies, random_chain, record, to_mjcf
 from jaxpanda_kernels import gravity_torque, inertia, mass_matrix
 
-from jaxpanda.arm import Arm
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.panda import published
 from jaxpanda.errors import InputError
 from jaxpanda.feasible import Bounds
 from jaxpanda.friction import Friction
@@ -40,7 +41,6 @@ from jaxpanda.identification.regression import (
     triangles,
 )
 from jaxpanda.identification.statistics import covariances, samples_as_one
-from jaxpanda.panda import panda, published
 from jaxpanda.parameters import arm_base_parameters, standard_names
 from jaxpanda.recordings import Recording, load
 from jaxpanda.retrieval import retrieve
@@ -83,12 +83,12 @@ def virtual(
 
 @pytest.fixture(scope="module")
 def found() -> Identification:
-    return identify(virtual(panda(), 20.0), panda())
+    return identify(virtual(Arm.panda(), 20.0), Arm.panda())
 
 
 @pytest.fixture(scope="module")
 def truth() -> np.ndarray:
-    return arm_base_parameters(panda()).projection @ np.asarray(panda().standard).ravel()
+    return arm_base_parameters(Arm.panda()).projection @ np.asarray(Arm.panda().standard).ravel()
 
 
 # --- from M(q) and g(q)
@@ -102,24 +102,24 @@ def exact_samples(arm: Arm, samples: int = 60) -> MassGravity:
 
 @pytest.fixture(scope="module")
 def samples() -> MassGravity:
-    return exact_samples(panda())
+    return exact_samples(Arm.panda())
 
 
 @pytest.mark.parametrize(("kept", "rank"), [("Mg", 43), ("M", 39), ("g", 12)])
 def test_mass_and_gravity_of_the_panda_have_the_published_ranks(samples, kept, rank):
     M, g = samples.M if "M" in kept else None, samples.g if "g" in kept else None
-    assert identify_mass_gravity(MassGravity("model", samples.q, M, g), panda()).rank == rank
+    assert identify_mass_gravity(MassGravity("model", samples.q, M, g), Arm.panda()).rank == rank
 
 
 def test_reverse_engineering_finds_the_parameters_behind_a_model(samples, truth):
-    result = identify_mass_gravity(samples, panda())
+    result = identify_mass_gravity(samples, Arm.panda())
     assert np.allclose(result.beta, truth, rtol=0, atol=1e-10)
     assert result.relative_error_percent < 1e-10
     assert result.settings["preferred_gravity"] == pytest.approx(9.80665, abs=1e-4)
 
 
 def test_samples_made_with_another_gravity_are_found_out():
-    arm = panda()
+    arm = Arm.panda()
     chain = dataclasses.replace(arm.chain, gravity=jnp.array([0.0, 0.0, -9.81]))
     samples = exact_samples(dataclasses.replace(arm, chain=chain))
     assert identify_mass_gravity(samples, arm).settings["preferred_gravity"] == pytest.approx(9.81, abs=1e-4)
@@ -127,7 +127,7 @@ def test_samples_made_with_another_gravity_are_found_out():
 
 
 def test_the_published_table_has_the_papers_condition_number_and_less_than_its_error(data: Path):
-    result = identify_mass_gravity(data / "gaz_panda" / "mass_gravity_1010.npz", panda())
+    result = identify_mass_gravity(data / "gaz_panda" / "mass_gravity_1010.npz", Arm.panda())
     assert result.rank == 43
     assert result.condition_number == pytest.approx(48.906, abs=5e-4)
     assert result.relative_error_percent <= 0.0315
@@ -151,7 +151,7 @@ def test_mass_and_gravity_come_from_a_users_mujoco_model(tmp_path: Path):
 def test_a_coefficient_lost_in_noise_is_marked_unreliable(samples):
     noise = 0.02 * np.random.default_rng(0).normal(size=samples.M.shape)
     noisy = dataclasses.replace(samples, M=samples.M + noise + np.swapaxes(noise, 1, 2))
-    result = identify_mass_gravity(noisy, panda())
+    result = identify_mass_gravity(noisy, Arm.panda())
     share = result.std / np.abs(result.beta)
     assert 0 < np.sum(~result.reliable) < 43
     assert np.array_equal(result.reliable, share <= 0.30)
@@ -175,7 +175,7 @@ def test_a_malformed_table_of_mass_and_gravity_is_refused(tmp_path, change, mess
     table = {"q": np.zeros((4, 7)), "M": np.tile(np.eye(7), (4, 1, 1)), "g": np.zeros((4, 7)), **change}
     np.savez(tmp_path / "table.npz", **{name: value for name, value in table.items() if value is not None})
     with pytest.raises(InputError, match=message):
-        identify_mass_gravity(tmp_path / "table.npz", panda())
+        identify_mass_gravity(tmp_path / "table.npz", Arm.panda())
 
 
 @pytest.mark.parametrize("content", [b"", b"time,q_1\n0,0\n", b"PK\x03\x04 and nothing else"])
@@ -210,7 +210,7 @@ def test_a_repeat_of_the_motion_is_held_out_with_what_it_repeats(found):
 
 
 def test_what_the_model_already_holds_counts_as_known(truth):
-    arm = panda()
+    arm = Arm.panda()
     rich = dataclasses.replace(
         arm,
         armature=jnp.full(7, 0.2),
@@ -226,16 +226,19 @@ def test_what_the_model_already_holds_counts_as_known(truth):
 
 
 def test_two_recordings_tell_more_than_one(found):
-    pair = [virtual(panda(), 10.0), dataclasses.replace(virtual(panda(), 20.0, seed=1), name="second.csv")]
-    both = identify(pair, panda(), folds=3)
-    one = identify(pair[0], panda(), folds=0)
+    pair = [
+        virtual(Arm.panda(), 10.0),
+        dataclasses.replace(virtual(Arm.panda(), 20.0, seed=1), name="second.csv"),
+    ]
+    both = identify(pair, Arm.panda(), folds=3)
+    one = identify(pair[0], Arm.panda(), folds=0)
     assert both.recordings == ("virtual.csv", "second.csv")
     assert np.median(both.classical_std / one.classical_std) < 0.8
 
 
 @pytest.mark.parametrize("joints", [1, 3])
 def test_a_long_recording_is_filtered_some_joints_at_a_time(monkeypatch, joints):
-    arm, signals = panda(), prepare(virtual(panda(), 4.0))
+    arm, signals = Arm.panda(), prepare(virtual(Arm.panda(), 4.0))
     base = arm_base_parameters(arm)
     at_once = regression(signals, arm, base, "none")
     monkeypatch.setattr(regression_module, "_AT_ONCE", joints * len(signals.q) * base.rank)
@@ -252,17 +255,17 @@ def _filtered_friction(signals) -> np.ndarray:
 
 def test_a_joint_that_only_trembles_shows_no_friction():
     """An iiwa's upright joints yielded by 2 mrad as others moved, and got damping of 106 N m s/rad."""
-    recording = virtual(panda(), 4.0)
+    recording = virtual(Arm.panda(), 4.0)
     q = recording.q.copy()
     q[:, 1] = q[0, 1] + 1e-3 * np.sin(2 * np.pi * 3.0 * recording.time)  # up to 19 mrad/s
-    arm, signals = panda(), prepare(dataclasses.replace(recording, q=q))
+    arm, signals = Arm.panda(), prepare(dataclasses.replace(recording, q=q))
     base = arm_base_parameters(arm)
     own = regression(signals, arm, base, "coulomb_viscous").A[:, :, base.rank :]
     assert np.flatnonzero(~own.any(axis=(0, 1))).tolist() == [2, 3]
 
 
 def test_an_arm_at_rest_tells_gravity_only_and_says_so():
-    arm = panda()
+    arm = Arm.panda()
     q = np.repeat(configurations(arm, 30, seed=1), 80, axis=0)
     t = np.arange(len(q)) / 50.0
     tau = np.asarray(jax.vmap(lambda q: gravity_torque(arm.chain, arm.standard, q))(jnp.asarray(q)))
@@ -275,7 +278,7 @@ def test_an_arm_at_rest_tells_gravity_only_and_says_so():
 
 def test_a_recording_of_one_pose_is_fitted_in_parameters_that_it_shows():
     # The pose's independent columns need not be those that the arm's own base parameters are named after.
-    arm = panda()
+    arm = Arm.panda()
     q = np.full((1500, 7), 0.1)
     tau = np.asarray(gravity_torque(arm.chain, arm.standard, jnp.asarray(q[0])))
     still = Recording("still.csv", np.arange(1500) / 500.0, q, None, np.tile(tau, (1500, 1)))
@@ -287,14 +290,14 @@ def test_a_recording_of_one_pose_is_fitted_in_parameters_that_it_shows():
 @pytest.mark.parametrize("folds", [1, -3])
 def test_folds_that_cannot_be_are_refused(folds):
     with pytest.raises(InputError, match="folds"):
-        identify(virtual(panda(), 4.0), panda(), folds=folds)
+        identify(virtual(Arm.panda(), 4.0), Arm.panda(), folds=folds)
 
 
 def test_friction_of_a_joint_that_does_not_move_is_not_made_up():
-    recording = virtual(panda(), 14.0)
+    recording = virtual(Arm.panda(), 14.0)
     q = recording.q.copy()
     q[:, 6] = 0.3
-    result = identify(dataclasses.replace(recording, q=q), panda(), folds=0)
+    result = identify(dataclasses.replace(recording, q=q), Arm.panda(), folds=0)
     assert result.friction.std["viscous"][6] == np.inf
     assert any("friction" in note for note in result.notes)
 
@@ -302,7 +305,9 @@ def test_friction_of_a_joint_that_does_not_move_is_not_made_up():
 def test_the_sigmoid_of_a_virtual_arm_comes_back():
     table = published()["sigmoid_friction"]
     sigmoid = Friction("sigmoid", {name: np.array(table[name]) for name in ("phi1", "phi2", "phi3")})
-    result = identify(virtual(panda(), 14.0, sigmoid, 0.01 * NOISE), panda(), friction="sigmoid", folds=0)
+    result = identify(
+        virtual(Arm.panda(), 14.0, sigmoid, 0.01 * NOISE), Arm.panda(), friction="sigmoid", folds=0
+    )
     assert np.allclose(result.friction.parameters["phi1"], sigmoid.parameters["phi1"], rtol=0.02)
     assert np.allclose(result.friction.parameters["phi2"], sigmoid.parameters["phi2"], rtol=0.05)
     assert np.allclose(result.friction.parameters["phi3"], sigmoid.parameters["phi3"], atol=0.002)
@@ -310,7 +315,7 @@ def test_the_sigmoid_of_a_virtual_arm_comes_back():
 
 
 def test_unweighted_least_squares_minimises_the_plain_residual(found):
-    plain = identify(virtual(panda(), 20.0), panda(), weighting="none", folds=0)
+    plain = identify(virtual(Arm.panda(), 20.0), Arm.panda(), weighting="none", folds=0)
     assert plain.relative_error_percent <= found.relative_error_percent
 
 
@@ -326,32 +331,32 @@ def test_unweighted_least_squares_minimises_the_plain_residual(found):
 )
 def test_an_option_that_does_not_exist_is_refused(change, message):
     with pytest.raises(InputError, match=message):
-        identify(virtual(panda(), 3.0), panda(), **change)
+        identify(virtual(Arm.panda(), 3.0), Arm.panda(), **change)
 
 
 def test_a_stuck_sensor_and_an_arm_at_rest_are_refused():
     """Both ended well, with coefficients of 1e-24 or friction that undid the model's own."""
-    moving = virtual(panda(), 3.0)
+    moving = virtual(Arm.panda(), 3.0)
     stuck = dataclasses.replace(moving, tau=np.where(np.arange(7) == 2, 1.0, moving.tau))
     with pytest.raises(InputError, match=r"virtual\.csv: column tau_3 never changes while its joint moves"):
-        identify([moving, stuck], panda())
+        identify([moving, stuck], Arm.panda())
     still = dataclasses.replace(
         moving, q=moving.q[:1] + 1e-5 * np.random.default_rng(0).normal(size=moving.q.shape)
     )
     with pytest.raises(InputError, match=r"virtual\.csv: no joint moves"):
-        identify(still, panda())
+        identify(still, Arm.panda())
 
 
 def test_a_motion_without_torque_is_refused():
     with pytest.raises(InputError, match="needs the measured torque"):
-        identify(dataclasses.replace(virtual(panda(), 3.0), tau=None), panda())
+        identify(dataclasses.replace(virtual(Arm.panda(), 3.0), tau=None), Arm.panda())
 
 
 def test_a_recording_of_another_arm_is_refused():
-    recording = virtual(panda(), 3.0)
+    recording = virtual(Arm.panda(), 3.0)
     other = Recording("ur.csv", recording.time, recording.q[:, :6], None, recording.tau[:, :6])
     with pytest.raises(InputError, match=r"ur\.csv: has 6 joints"):
-        identify(other, panda())
+        identify(other, Arm.panda())
 
 
 # --- error bars
@@ -464,8 +469,8 @@ def test_one_step_finds_links_that_could_be_built_and_the_convex_optimum(monkeyp
     posed = {}
     original = feasible_fit.problem
     monkeypatch.setattr(feasible_fit, "problem", lambda *args: posed.setdefault("problem", original(*args)))
-    recording = virtual(panda(), 14.0, noise=2 * NOISE)
-    result = identify(recording, panda(), method="one_step", folds=0)
+    recording = virtual(Arm.panda(), 14.0, noise=2 * NOISE)
+    result = identify(recording, Arm.panda(), method="one_step", folds=0)
     lower, _ = feasible_fit.friction_bounds("coulomb_viscous_offset", 7, {})
     least = clarabel_optimum(*posed["problem"], Bounds.panda(), lower)
     assert result.settings["objective"] <= least * (1 + 1e-3)
@@ -486,7 +491,7 @@ def gaz(data: Path) -> Recording:
 
 
 def test_the_classical_model_explains_the_real_trajectory_as_well_as_the_reference(gaz):
-    result = identify(gaz, panda())
+    result = identify(gaz, Arm.panda())
     assert result.rank == 43
     assert result.cross_validated_relative_error_percent <= 1.52
     assert result.relative_error_percent < result.cross_validated_relative_error_percent
@@ -495,7 +500,7 @@ def test_the_classical_model_explains_the_real_trajectory_as_well_as_the_referen
 
 @pytest.mark.slow
 def test_the_feasible_model_explains_the_real_trajectory_better_than_the_classical(gaz):
-    result = identify(gaz, panda(), method="one_step")
+    result = identify(gaz, Arm.panda(), method="one_step")
     assert result.cross_validated_relative_error_percent <= 1.30
     assert result.settings["max_violation"] == 0
 
@@ -526,7 +531,7 @@ def test_the_published_table_is_read_as_a_bare_table_of_coefficients(tmp_path):
     assert table.method is None
     assert table.projection.shape == (43, 70)
     assert np.sum(~table.reliable) == 2
-    assert np.array_equal(table.projection, arm_base_parameters(panda()).projection)
+    assert np.array_equal(table.projection, arm_base_parameters(Arm.panda()).projection)
 
 
 ROW = {"terms": {"m1": 1}, "value": 1.0}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from jaxpanda_kernels import gravity_torque
 
+from jaxpanda.arms.arm import Arm
 from jaxpanda.errors import InputError
 from jaxpanda.inspection import Inspection, inspect
-from jaxpanda.panda import panda
 from jaxpanda.recordings import Origin, Recording, load
 
 CENTRE = np.array([0.0, -0.3, 0.0, -1.8, 0.0, 1.8, 0.0])
@@ -23,7 +23,7 @@ def excitation(time: np.ndarray) -> np.ndarray:
     return CENTRE + 0.4 * np.sum(np.sin(time[:, None, None] * frequency + phase) / frequency, axis=1)
 
 
-nominal = jax.jit(jax.vmap(panda().inverse_dynamics))
+nominal = jax.jit(jax.vmap(Arm.panda().inverse_dynamics))
 
 
 def virtual(q=excitation, *, late: float = 0.0, noise: float = 0.02, rate: float = 250.0) -> Recording:
@@ -43,7 +43,7 @@ def said(found: Inspection) -> str:
 
 
 def test_a_joint_that_slides_is_told_in_metres():
-    arm = panda()
+    arm = Arm.panda()
     assert inspect(virtual(), arm).table()[0][1] == "range rad"
     arm = eqx.tree_at(lambda a: a.chain.prismatic, arm, arm.chain.prismatic.at[6].set(True))
     found = inspect(virtual(), arm)
@@ -52,7 +52,7 @@ def test_a_joint_that_slides_is_told_in_metres():
 
 
 def test_a_clean_recording_is_found_right_in_every_respect():
-    found = inspect(virtual(late=5e-3), panda())
+    found = inspect(virtual(late=5e-3), Arm.panda())
     assert found.channels == ("q", "dq", "tau")
     assert (found.dof, found.samples, found.missing, found.repeated_rows, found.gaps) == (7, 3000, 0, 0, ())
     assert found.rate == pytest.approx(250.0)
@@ -74,7 +74,7 @@ def test_a_clean_recording_is_found_right_in_every_respect():
 def test_a_reversed_torque_is_noticed():
     good = virtual()
     assert good.tau is not None
-    found = inspect(Recording("reversed", good.time, good.q, good.qd, -good.tau), panda())
+    found = inspect(Recording("reversed", good.time, good.q, good.qd, -good.tau), Arm.panda())
     assert "torque column of all joints has the wrong sign" in said(found)
     assert "torque in N m, positive" not in said(found)
 
@@ -82,19 +82,21 @@ def test_a_reversed_torque_is_noticed():
 def test_one_reversed_joint_is_named():
     good = virtual()
     assert good.tau is not None
-    found = inspect(Recording("one", good.time, good.q, good.qd, good.tau * [1, 1, 1, -1, 1, 1, 1]), panda())
+    found = inspect(
+        Recording("one", good.time, good.q, good.qd, good.tau * [1, 1, 1, -1, 1, 1, 1]), Arm.panda()
+    )
     assert "torque column of joint 4 has the wrong sign" in said(found)
 
 
 def test_a_torque_in_other_units_is_noticed():
     good = virtual()
     assert good.tau is not None
-    found = inspect(Recording("millinewtons", good.time, good.q, good.qd, 1000 * good.tau), panda())
+    found = inspect(Recording("millinewtons", good.time, good.q, good.qd, 1000 * good.tau), Arm.panda())
     assert "1000 times the joint torque: mNm. Give `--torque-unit mNm`." in said(found)
 
 
 def test_gravity_taken_out_by_the_controller_is_noticed():
-    good, arm = virtual(), panda()
+    good, arm = virtual(), Arm.panda()
     assert good.tau is not None
     gravity = jax.vmap(lambda q: gravity_torque(arm.chain, arm.standard, q))(jnp.asarray(good.q))
     found = inspect(Recording("free", good.time, good.q, good.qd, good.tau - np.asarray(gravity)), arm)
@@ -108,11 +110,11 @@ def test_what_a_source_says_of_gravity_is_tested_by_the_motion(declared, without
     recording = virtual()
     assert recording.tau is not None
     if without:
-        arm = panda()
+        arm = Arm.panda()
         weight = jax.vmap(lambda q: gravity_torque(arm.chain, arm.standard, q))(jnp.asarray(recording.q))
         recording = dataclasses.replace(recording, tau=recording.tau - np.asarray(weight))
     origin = Origin("somebody's driver", {"q": "position"}, declared, "what it says")
-    found = inspect(dataclasses.replace(recording, origin=origin), panda())
+    found = inspect(dataclasses.replace(recording, origin=origin), Arm.panda())
     wrong = declared != "unstated" and without != (declared == "gravity_removed")
     assert ("somebody's driver says that its torque" in said(found)) == wrong
     assert "its source says: what it says" in " ".join(found.lines())
@@ -122,7 +124,7 @@ def test_a_joint_that_rests_is_named_and_shows_less():
     def held(time):
         return np.where(np.arange(7) == 2, CENTRE, excitation(time))
 
-    found = inspect(virtual(held), panda())
+    found = inspect(virtual(held), Arm.panda())
     assert found.joints[2].rest == 1.0
     assert found.joints[2].reversals == 0
     assert "joints 3 hardly move" in said(found)
@@ -132,13 +134,15 @@ def test_a_joint_that_rests_is_named_and_shows_less():
 
 
 def test_a_motion_outside_the_model_s_limits_is_noticed():
-    found = inspect(virtual(lambda t: excitation(t) + 2.5 * np.eye(7)[3]), panda())
+    found = inspect(virtual(lambda t: excitation(t) + 2.5 * np.eye(7)[3]), Arm.panda())
     assert "joint 4 goes from" in said(found)
 
 
 def test_a_motion_and_a_missing_model_are_said():
     good = virtual()
-    assert "a motion, which can be predicted for" in said(inspect(Recording("m", good.time, good.q), panda()))
+    assert "a motion, which can be predicted for" in said(
+        inspect(Recording("m", good.time, good.q), Arm.panda())
+    )
     found = inspect(good)
     assert found.identifiable is None
     assert "cannot be told without a model" in said(found)
@@ -150,7 +154,7 @@ def test_gaps_repeats_and_jitter_are_counted():
     rows = np.r_[0:1000, 1060:3000]
     q, tau = good.q[rows].copy(), good.tau[rows].copy()
     q[500:600:2], tau[500:600:2] = q[499:599:2], tau[499:599:2]
-    found = inspect(Recording("gappy", good.time[rows], q, None, tau), panda())
+    found = inspect(Recording("gappy", good.time[rows], q, None, tau), Arm.panda())
     assert found.missing == 60
     assert found.repeated_rows == 50
     assert found.gaps[0] == (pytest.approx(3.996), pytest.approx(0.244))
@@ -162,11 +166,11 @@ def test_gaps_repeats_and_jitter_are_counted():
 def test_an_arm_with_another_number_of_joints_is_refused():
     good = virtual()
     with pytest.raises(InputError, match=r"6 joints .* where the model has 7"):
-        inspect(Recording("six", good.time, good.q[:, :6]), panda())
+        inspect(Recording("six", good.time, good.q[:, :6]), Arm.panda())
 
 
 def test_everything_is_plain_json_and_fits_a_table():
-    found = inspect(virtual(), panda())
+    found = inspect(virtual(), Arm.panda())
     document = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert document["schema"] == "jaxpanda.inspection/1"
     assert len(document["joints"]) == 7
@@ -177,7 +181,7 @@ def test_everything_is_plain_json_and_fits_a_table():
 
 
 def test_the_log_of_gaz_et_al_is_what_the_notes_say(data):
-    found = inspect(load(data / "gaz_panda"), panda())
+    found = inspect(load(data / "gaz_panda"), Arm.panda())
     assert found.identifiable is not None
     assert found.identifiable.rank == 43
     lags = [joint.velocity_lag for joint in found.joints]

@@ -9,11 +9,12 @@ import pytest
 from jaxpanda_kernels import inertia
 
 import jaxpanda
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.source import is_panda
 from jaxpanda.errors import InputError
 from jaxpanda.feasible import Bounds, solve
 from jaxpanda.feasible.convex import scaled_problem, starting_points
 from jaxpanda.feasible.nearest import are_buildable
-from jaxpanda.panda import is_panda, panda
 
 MASS, COM = np.array([2.0, 1.0]), np.array([[0.0, 0.02, 0.1], [0.05, 0.0, -0.03]])
 I_COM = np.array([[0.03, 0.025, 0.02, 0.001, 0, -0.002], [0.01, 0.012, 0.009, 0, 0.001, 0]])
@@ -163,7 +164,7 @@ def test_bodies_heavier_than_a_bound_are_refused():
 
 def test_another_arm_called_panda_is_another_arm():
     """The Panda with hand got the bounds of the one without."""
-    own = panda()
+    own = Arm.panda()
     other = dataclasses.replace(own, standard=own.standard.at[6, 0].add(0.73))
     assert other.name == "panda"
     assert is_panda(own)

@@ -4,9 +4,9 @@ import mujoco
 import pytest
 from mjcf_cases import FILES, MODELS, REAL, chain_of
 
-from jaxpanda.export import panda_mjcf, write_parameters
-from jaxpanda.lint import ignored_by_mjx, lint
-from jaxpanda.mjcf import from_mjcf
+from jaxpanda.arms.export import panda_mjcf, write_parameters
+from jaxpanda.arms.lint import ignored_by_mjx, lint
+from jaxpanda.arms.source import from_mjcf
 
 
 def grave(model) -> list[tuple[str, str]]:

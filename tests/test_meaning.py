@@ -14,10 +14,10 @@ from helpers import result
 
 from jaxpanda import Recording
 from jaxpanda.__main__ import main
+from jaxpanda.arms.source import from_mjcf
 from jaxpanda.diagnosis.finding import FAMILIES
 from jaxpanda.effects import CATALOGUE
 from jaxpanda.meaning import meaning, mounted
-from jaxpanda.mjcf import from_mjcf
 from jaxpanda.recordings import save
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"

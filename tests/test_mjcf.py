@@ -7,10 +7,11 @@ import pytest
 from jaxpanda_kernels import inertia
 from mjcf_cases import CASES, MODELS, chain_of, mujoco_torque, random_states
 
-from jaxpanda import mjcf
+from jaxpanda.arms import mjcf
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.mjcf import load_model
+from jaxpanda.arms.source import from_mjcf
 from jaxpanda.errors import InputError
-from jaxpanda.mjcf import from_mjcf, load_model
-from jaxpanda.panda import panda
 
 
 @pytest.mark.parametrize("path", CASES, ids=lambda path: path.stem)
@@ -24,8 +25,8 @@ def test_torques_are_those_of_mujoco(path):
 
 def test_a_level_panda_file_has_the_frames_of_the_published_table():
     arm = from_mjcf(MODELS / "menagerie_like.xml")[0]
-    np.testing.assert_allclose(arm.chain.R, panda().chain.R, atol=1e-15)
-    np.testing.assert_allclose(arm.chain.p, panda().chain.p, atol=1e-15)
+    np.testing.assert_allclose(arm.chain.R, Arm.panda().chain.R, atol=1e-15)
+    np.testing.assert_allclose(arm.chain.p, Arm.panda().chain.p, atol=1e-15)
 
 
 def test_joint_classes_give_armature_damping_and_limits():

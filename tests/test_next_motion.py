@@ -10,6 +10,7 @@ import pytest
 import scipy.interpolate
 
 from jaxpanda import Arm, Recording
+from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.diagnosis.coverage import held_out_gains, least_shown
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.next_motion import motions, next_motion
@@ -20,7 +21,6 @@ from jaxpanda.diagnosis.state import with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects.friction import ViscousFriction
 from jaxpanda.effects.sensing import TorqueOffset
-from jaxpanda.export import panda_mjcf
 from jaxpanda.simulation import FourierTrajectory, JointFriction, Sensors, random_trajectory, simulate
 
 JOINT, OFFSET = 5, 0.03

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from jaxpanda_kernels import from_modified_dh, rnea
 
-from jaxpanda.arm import Arm
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.panda import published
 from jaxpanda.errors import InputError
-from jaxpanda.panda import panda, published
 from jaxpanda.parameters import (
     arm_base_parameters,
     base_parameters,
@@ -49,7 +49,7 @@ def test_the_standard_parameters_are_named_in_the_kernels_order():
 
 
 def test_the_pandas_base_parameters_are_the_43_of_table_iii(table):
-    base = arm_base_parameters(panda())
+    base = arm_base_parameters(Arm.panda())
     assert base.rank == 43
     assert np.max(np.abs(base.projection - table)) < 1e-9
     names = standard_names(7)
@@ -57,12 +57,12 @@ def test_the_pandas_base_parameters_are_the_43_of_table_iii(table):
 
 
 def test_base_parameters_do_not_depend_on_the_states_drawn():
-    first, second = (arm_base_parameters(panda(), seed=seed) for seed in (1, 2))
+    first, second = (arm_base_parameters(Arm.panda(), seed=seed) for seed in (1, 2))
     assert np.array_equal(first.projection, second.projection)
 
 
 def test_expressions_read_as_the_paper_prints_them():
-    expressions = arm_base_parameters(panda()).expressions
+    expressions = arm_base_parameters(Arm.panda()).expressions
     assert expressions[0] == "J2yy + J1zz"
     assert expressions[1] == "J2xx - J2yy + J3yy + 0.0999 m3 + 0.632 m3c3z + 0.1067 (m4 + m5 + m6 + m7)"
     assert expressions[6] == "J3xx - J3yy + J4yy - 0.0068 m4"
@@ -112,7 +112,7 @@ def test_an_upright_first_axis_leaves_gravity_out():
 
 
 def test_null_directions_move_no_torque(table):
-    arm = panda()
+    arm = Arm.panda()
     null = np.linalg.svd(table)[2][43:]
     q = jax.random.normal(jax.random.key(0), (3, 7))
     moved = arm.standard + jnp.asarray(null.sum(0)).reshape(7, 10)

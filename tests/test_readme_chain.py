@@ -13,10 +13,11 @@ from test_commands import shaken
 
 import jaxpanda
 from jaxpanda.__main__ import main
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.panda import published
 from jaxpanda.errors import InputError
 from jaxpanda.feasible.buildable import doubts, reach
 from jaxpanda.identification import Identification
-from jaxpanda.panda import panda, published
 from jaxpanda.recordings import save
 from jaxpanda.retrieval import Retrieval
 
@@ -108,7 +109,7 @@ def test_links_that_nobody_would_build_are_told(retrieved, identified, capsys):
 
 
 def test_an_arm_that_was_built_is_beyond_doubt():
-    arm = panda()
+    arm = Arm.panda()
     assert doubts(np.asarray(arm.standard), arm.link_names, reach(arm)) == []
 
 

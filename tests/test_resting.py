@@ -10,12 +10,12 @@ from scipy.signal import lfilter
 
 from jaxpanda import Arm, Recording
 from jaxpanda.__main__ import main
+from jaxpanda.arms.export import panda_mjcf
+from jaxpanda.arms.source import from_mjcf
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.resting import AtRest, judge
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
-from jaxpanda.export import panda_mjcf
-from jaxpanda.mjcf import from_mjcf
 from jaxpanda.recordings import save
 
 LOSS = 0.4

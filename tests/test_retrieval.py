@@ -7,9 +7,10 @@ import pickle
 import numpy as np
 import pytest
 
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.panda import published
 from jaxpanda.errors import InputError
 from jaxpanda.feasible import Bounds
-from jaxpanda.panda import panda, published
 from jaxpanda.parameters import coefficient_matrix
 from jaxpanda.retrieval import Retrieval, retrieve
 
@@ -115,7 +116,7 @@ def quick() -> dict:
 def test_where_nothing_is_left_to_gain_the_last_digits_do_not_make_one_solution_better(quick):
     """Coefficients that links of the Panda have exactly: rounding leaves 1e-16 of them, more or less."""
     rows = table()["coefficients"]
-    values = coefficient_matrix([row["terms"] for row in rows], 7) @ panda().standard.ravel()
+    values = coefficient_matrix([row["terms"] for row in rows], 7) @ Arm.panda().standard.ravel()
     exact = {"coefficients": [row | {"value": float(v)} for row, v in zip(rows, values, strict=True)]}
     links = retrieve(exact, **quick)
     assert links.as_good > 0.9 * links.starts
@@ -142,7 +143,7 @@ def test_a_user_constraint_holds_and_its_margin_is_reported(quick):
 
 
 def test_links_stay_near_the_nominal_ones_in_what_the_coefficients_do_not_tell(quick):
-    arm = panda()
+    arm = Arm.panda()
     near = retrieve(table(), arm=arm, prefer="nominal", **quick)
     best = retrieve(table(), prefer="best", **quick)
     distance = lambda r: np.sum((r[:, 0] - np.asarray(arm.standard[:, 0])) ** 2)

@@ -16,7 +16,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxpanda import Arm, InputError, markup, rollout
+from jaxpanda import Arm, InputError, rollout
+from jaxpanda.arms import markup
+from jaxpanda.arms.mjcf import move_standard
+from jaxpanda.arms.source import from_document
 from jaxpanda.corrected import Corrected, Plant
 from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.drive import Backlash, JointElasticity
@@ -26,7 +29,6 @@ from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TorqueOffset
 from jaxpanda.effects.stribeck import StribeckFriction
 from jaxpanda.effects.unknown import Unknown, UnknownAt, UnknownOfTwo
-from jaxpanda.mjcf import from_document, move_standard
 from jaxpanda.recordings import Recording, save
 from jaxpanda.simulation import JointFriction, Sensors, fourier_trajectory, simulate
 
@@ -305,7 +307,7 @@ def test_a_concealed_effect_s_own_numbers_bring_the_simulation_to_the_recorded_m
         shape = PayloadChange(6, start, stop, name, "carried")
         found = shape, np.linalg.solve(shape._basis[0], phi)
     from jaxpanda import load
-    from jaxpanda.mjcf import from_mjcf
+    from jaxpanda.arms.source import from_mjcf
 
     arm, source = from_mjcf(tmp_path / "model.xml")
     result = rollout.compare(corrected(arm, found), source, load(tmp_path / name))

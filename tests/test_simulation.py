@@ -13,8 +13,9 @@ from helpers import random_bodies, random_chain, to_mjcf
 from numpy.testing import assert_allclose
 
 import jaxpanda.simulation
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.panda import published
 from jaxpanda.errors import InputError
-from jaxpanda.panda import panda, published
 from jaxpanda.simulation import (
     JointFriction,
     Sensors,
@@ -37,7 +38,7 @@ PENDULUM = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" {joint}/
 
 @pytest.fixture(scope="module")
 def xml() -> str:
-    arm = panda()
+    arm = Arm.panda()
     return to_mjcf(arm.chain, arm.standard)
 
 

@@ -84,7 +84,7 @@ def test_what_a_healthy_arm_hummed_before_is_not_missing():
 
 @pytest.mark.slow
 def test_a_diagnosis_says_that_it_hums_beside_what_it_finds(tmp_path):
-    from jaxpanda.export import panda_mjcf
+    from jaxpanda.arms.export import panda_mjcf
 
     (tmp_path / "arm.xml").write_text(panda_mjcf(), "utf-8")
     rubs, hums = (lambda t, q, qd: 0.5 * np.sign(qd) * (np.arange(7) == 3)), at_joints(0.1, 50.0, 1)

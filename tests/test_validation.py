@@ -12,11 +12,12 @@ from helpers import to_mjcf
 from numpy.testing import assert_allclose
 
 from jaxpanda import validation
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.export import panda_mjcf
+from jaxpanda.arms.panda import published
+from jaxpanda.arms.source import from_mjcf
 from jaxpanda.errors import InputError
-from jaxpanda.export import panda_mjcf
 from jaxpanda.friction import Friction
-from jaxpanda.mjcf import from_mjcf
-from jaxpanda.panda import panda, published
 from jaxpanda.recordings import Recording
 from jaxpanda.simulation import JointFriction, Sensors, fourier_trajectory, panda_sensors, simulate
 from jaxpanda.validation import (
@@ -261,7 +262,7 @@ def test_bad_input_is_named(write, recorded):
 
 @pytest.mark.slow
 def test_the_panda_validates_in_every_engine(tmp_path):
-    arm = panda()
+    arm = Arm.panda()
     path = tmp_path / "panda.xml"
     path.write_text(to_mjcf(arm.chain, arm.standard, 'frictionloss="0.2" damping="0.05"'), "utf-8")
     table = published()["exciting_trajectory"]

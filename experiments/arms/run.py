@@ -15,9 +15,10 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 from jaxpanda import ModelFile, Part, identify, retrieve, to_mjcf, validate  # noqa: E402
+from jaxpanda.arms.mjcf import load_model  # noqa: E402
+from jaxpanda.arms.source import from_mjcf  # noqa: E402
 from jaxpanda.demo import record  # noqa: E402
 from jaxpanda.errors import InputError  # noqa: E402
-from jaxpanda.mjcf import from_mjcf, load_model  # noqa: E402
 
 HERE = Path(__file__).parent
 STATES = 20

@@ -18,7 +18,7 @@ import numpy as np
 
 import jaxpanda
 from jaxpanda import session
-from jaxpanda.export import panda_mjcf
+from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.simulation import JointFriction, panda_sensors, perturbed, random_trajectory, simulate
 
 DT = 1e-3

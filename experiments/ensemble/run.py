@@ -14,7 +14,7 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 from jaxpanda import Arm, draw_ensemble, identify, prepare, retrieve  # noqa: E402
-from jaxpanda.export import panda_mjcf  # noqa: E402
+from jaxpanda.arms.export import panda_mjcf  # noqa: E402
 from jaxpanda.simulation import (  # noqa: E402
     JointFriction,
     Sensors,

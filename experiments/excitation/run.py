@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpanda.arm import Arm
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.export import panda_mjcf
+from jaxpanda.arms.mjcf import standard_from_com
+from jaxpanda.arms.panda import published
 from jaxpanda.excitation import excite
 from jaxpanda.excitation.design import friction_columns, gram, rows
-from jaxpanda.export import panda_mjcf
 from jaxpanda.identification import identify
-from jaxpanda.mjcf import standard_from_com
-from jaxpanda.panda import published
 from jaxpanda.parameters import arm_base_parameters
 from jaxpanda.simulation import (
     FourierTrajectory,

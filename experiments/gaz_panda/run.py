@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import inertia
 
-from jaxpanda.arm import Arm
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.panda import published
 from jaxpanda.friction import SIGMOID, Friction
 from jaxpanda.identification import (
     Identification,
@@ -19,7 +20,6 @@ from jaxpanda.identification import (
     load_mass_gravity,
 )
 from jaxpanda.identification.regression import regression
-from jaxpanda.panda import panda, published
 from jaxpanda.parameters import arm_base_parameters
 from jaxpanda.recordings import load
 from jaxpanda.signals import Signals, prepare
@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder that holds gaz_panda")
     parser.add_argument("--sigmoid", action="store_true", help="fit the friction of eq. 25 too (slower)")
     options = parser.parse_args()
-    folder, arm = options.data / "gaz_panda", panda()
+    folder, arm = options.data / "gaz_panda", Arm.panda()
 
     from_mass_and_gravity(load_mass_gravity(folder / "mass_gravity_1010.npz"), arm)
 

@@ -106,7 +106,11 @@ def killed(name: str, words: list[str], out: Path, rng: random.Random, count: in
             child.send_signal(kind)
             said = child.communicate()[1]
         found["ended before" if child.returncode == 0 else kind.name] += 1
-        if kind != signal.SIGKILL and child.returncode not in (0, 1):
+        if kind != signal.SIGKILL and child.returncode not in (
+            0,
+            1,
+            -signal.SIGINT,
+        ):  # Python's own, after the sentence
             found["before it had begun" if child.returncode == -kind else f"status {child.returncode}"] += 1
         if kind != signal.SIGKILL and child.returncode == 1 and said.strip().count("\n"):
             found["no sentence"] += 1
@@ -125,6 +129,7 @@ def main() -> int:
     options.add_argument("--only", nargs="*", default=())
     given = options.parse_args()
     rng, bad = random.Random(given.seed), 0
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # else a script in the background ignores it
     session.start()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

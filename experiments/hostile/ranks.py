@@ -302,6 +302,7 @@ def main() -> int:
     options.add_argument("--only", default="", help="faults whose name has this in it")
     given = options.parse_args()
     rng, bad = random.Random(given.seed), 0
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # else a script in the background ignores it
     faults = [fault for fault in FAULTS if given.only in fault.__name__]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -127,12 +127,12 @@ def material(folder: Path) -> dict[str, Path]:
     import jax.numpy as jnp
 
     import jaxpanda
+    from jaxpanda.arms.export import panda_mjcf
+    from jaxpanda.arms.urdf import to_urdf
     from jaxpanda.demo import record
-    from jaxpanda.export import panda_mjcf
     from jaxpanda.feasible import Bounds
     from jaxpanda.files import write_json, write_npz, write_text
     from jaxpanda.recordings import save
-    from jaxpanda.urdf import to_urdf
 
     short = thinned(record(seed=3, duration=2.0).recording)
     out = {name: folder / f"arm.{name}" for name in ("csv", "csv.gz", "npz", "parquet")}
@@ -220,12 +220,12 @@ def reader(format: str) -> Callable[[Path], Any]:
     import numpy as np
 
     from jaxpanda import corrected, recordings
+    from jaxpanda.arms.source import from_mjcf
     from jaxpanda.demo import record
     from jaxpanda.diagnosis import predict
     from jaxpanda.feasible import Bounds
     from jaxpanda.files import to_json
     from jaxpanda.identification import Identification, load_mass_gravity
-    from jaxpanda.mjcf import from_mjcf
 
     motion = record(seed=4, duration=1.0).recording
 

@@ -10,11 +10,11 @@ import numpy as np
 from jaxpanda_kernels import regressor
 
 from jaxpanda import signals
-from jaxpanda.arm import Arm
-from jaxpanda.export import write_parameters
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.export import write_parameters
+from jaxpanda.arms.source import from_mjcf
 from jaxpanda.friction import Friction
 from jaxpanda.identification import identify
-from jaxpanda.mjcf import from_mjcf
 from jaxpanda.recordings import Recording
 
 _SPREAD = 0.2

@@ -12,8 +12,9 @@ import jax
 import numpy as np
 from jaxpanda_kernels import inertia
 
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.panda import published
 from jaxpanda.feasible.solver import STARTS
-from jaxpanda.panda import panda, published
 from jaxpanda.parameters import coefficient_matrix
 from jaxpanda.retrieval import Retrieval, retrieve
 
@@ -29,9 +30,9 @@ def objective(standard: np.ndarray) -> float:
 
 def published_objectives() -> tuple[float, float]:
     """Of the published parameters, as printed and with c6z corrected."""
-    corrected = np.asarray(panda().standard)
+    corrected = np.asarray(Arm.panda().standard)
     printed = corrected.copy()
-    mass, com, I_com = inertia.to_com(panda().standard[5])
+    mass, com, I_com = inertia.to_com(Arm.panda().standard[5])
     printed[5] = inertia.from_com(mass, com.at[2].set(-0.010517), I_com)
     return objective(printed), objective(corrected)
 

@@ -34,7 +34,7 @@ def record(folder: Path) -> None:
     """Write model.xml and two pairs of recordings."""
     import numpy as np
 
-    from jaxpanda.export import panda_mjcf
+    from jaxpanda.arms.export import panda_mjcf
     from jaxpanda.simulation import JointFriction, panda_sensors, random_trajectory, simulate
 
     text = panda_mjcf()
@@ -96,8 +96,8 @@ def diagnoses(folder: Path, rounds: int) -> dict:
 
 def identifications(folder: Path, rounds: int) -> list[dict]:
     """`identify` again and again."""
+    from jaxpanda.arms.source import from_mjcf
     from jaxpanda.identification import identify
-    from jaxpanda.mjcf import from_mjcf
     from jaxpanda.recordings import load
 
     arm, _ = from_mjcf(folder / "model.xml")

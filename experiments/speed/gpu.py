@@ -48,7 +48,7 @@ def ensemble(arms: int, seconds: float, limit: float, steps_of_gradient: int) ->
     sys.path.insert(0, str(BENCHMARKS))
     from rnea import undisturbed
 
-    from jaxpanda.export import panda_mjcf
+    from jaxpanda.arms.export import panda_mjcf
 
     model = mujoco.MjModel.from_xml_string(panda_mjcf())
     model.opt.timestep, model.opt.integrator = 2e-3, mujoco.mjtIntegrator.mjINT_IMPLICITFAST

@@ -38,8 +38,8 @@ REACHED = 1e-12
 def _problem():
     import numpy as np
 
+    from jaxpanda.arms.panda import published
     from jaxpanda.feasible import Bounds
-    from jaxpanda.panda import published
     from jaxpanda.parameters import coefficient_matrix
 
     rows = [row for row in published()["coefficients"] if row["reliable"]]
@@ -57,13 +57,13 @@ def _peer_problem():
 
 
 def _retrieve(starts: int, seed: int = 0, reachable: bool = False, **options) -> dict:
+    from jaxpanda.arms.arm import Arm
     from jaxpanda.feasible import solve
-    from jaxpanda.panda import panda
 
     A, b, bounds = _problem()
     most = GOOD * OPTIMUM
     if reachable:
-        b = A @ panda().standard.ravel()
+        b = A @ Arm.panda().standard.ravel()
         most = REACHED * b @ b
     wall, cpu = time.perf_counter(), time.process_time()
     found = solve(A, b, bounds, starts=starts, seed=seed, **options)
@@ -147,7 +147,7 @@ def ours_on_gpus(options: dict) -> dict:
 def million(options: dict) -> dict:
     """One fresh process from nothing to all outcomes in a file, checkpoint included."""
     from jaxpanda import session
-    from jaxpanda.panda import published
+    from jaxpanda.arms.panda import published
     from jaxpanda.retrieval import Retrieval, retrieve
 
     began = time.perf_counter()
@@ -223,7 +223,7 @@ def make_recordings(options: dict) -> dict:
     import jax
     import numpy as np
 
-    from jaxpanda.export import panda_mjcf
+    from jaxpanda.arms.export import panda_mjcf
     from jaxpanda.recordings import save
     from jaxpanda.simulation import JointFriction, panda_sensors, random_trajectory, simulate
 
@@ -403,7 +403,7 @@ def _diagnosis_row(table: Table, name: str, found: dict) -> None:
 
 
 def _published_table() -> str:
-    from jaxpanda.panda import published
+    from jaxpanda.arms.panda import published
 
     return json.dumps({"coefficients": published()["coefficients"]})
 

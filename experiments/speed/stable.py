@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from gpu import AMPLITUDE, DAMPING, FREQUENCY, STIFFNESS
 
-from jaxpanda.export import panda_mjcf
+from jaxpanda.arms.export import panda_mjcf
 
 
 def largest_error(time_step: float, as_damping: bool, seconds: float = 10.0) -> tuple[float, float]:

@@ -24,9 +24,9 @@ import motion
 jax.config.update("jax_enable_x64", True)
 
 from jaxpanda import Recording, load  # noqa: E402
+from jaxpanda.arms.source import from_mjcf  # noqa: E402
 from jaxpanda.convention import Convention  # noqa: E402
 from jaxpanda.meaning import meaning  # noqa: E402
-from jaxpanda.mjcf import from_mjcf  # noqa: E402
 
 G = 9.81
 WRONG = {

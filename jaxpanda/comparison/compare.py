@@ -22,7 +22,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..diagnosis import predict
 from ..errors import InputError, require_x64
 from ..friction import UNITS

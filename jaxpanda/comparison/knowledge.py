@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..corrected import FILE as CORRECTED
 from ..corrected import Corrected
 from ..errors import InputError
@@ -16,7 +16,6 @@ from ..friction import MODELS
 from ..identification import Identification
 from ..identification.result import FILE as IDENTIFICATION
 from ..inputs import read_json
-from ..panda import panda
 from ..parameters import expression, linear_forms
 from ..posterior import Posterior, named
 from ..retrieval import FILE as RETRIEVAL
@@ -75,7 +74,7 @@ def kind_of(folder: str | Path) -> str:
 
 def _identification(folder: Path) -> Known:
     found = Identification.load(folder)
-    arm = found.model or (panda() if found.arm in ("", "panda") and found.dof == 7 else None)
+    arm = found.model or (Arm.panda() if found.arm in ("", "panda") and found.dof == 7 else None)
     C = found.joint_covariance if found.joint_covariance is not None else found.covariance
     if C is None or arm is None:
         raise InputError(
@@ -108,7 +107,7 @@ def _identification(folder: Path) -> Known:
 
 def _retrieval(folder: Path) -> Known:
     found = Retrieval.load(folder)
-    arm = found.model or (panda() if found.arm in ("", "panda") and found.dof == 7 else None)
+    arm = found.model or (Arm.panda() if found.arm in ("", "panda") and found.dof == 7 else None)
     if found.posterior is None or arm is None:
         raise InputError(f"{folder}: holds no posterior.npz or no arm, as an older version; retrieve again")
     settings = {

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import inputs, report
+from ..arms.export import missing_assets
+from ..arms.model_file import Model
 from ..convention import PLAIN, Convention
 from ..corrected import KIND, XML, read
 from ..errors import InputError
-from ..export import missing_assets
 from ..files import output_file, output_folder, write_text
-from ..model_file import Model
 from ..reading import Reading
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare

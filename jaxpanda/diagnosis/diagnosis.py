@@ -10,16 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .. import files, markup
+from .. import files
 from .. import signals as signals_
-from ..arm import Arm
+from ..arms import markup
+from ..arms.arm import Arm
+from ..arms.export import missing_assets, panda_mjcf
+from ..arms.mjcf import MjcfSource, with_gravity
+from ..arms.model_file import Model
+from ..arms.source import from_document, from_mjcf
 from ..corrected import KIND, Corrected, read
 from ..effects import AbstractEffect, catalogue_with
 from ..effects.drive import Armature
 from ..errors import InputError, require_x64
-from ..export import missing_assets, panda_mjcf
-from ..mjcf import MjcfSource, from_document, from_mjcf, with_gravity
-from ..model_file import Model
 from ..posterior import FILE as POSTERIOR_FILE
 from ..recordings import Recording, distinct, load
 from ..session import Say, silent

@@ -16,7 +16,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..errors import InputError
 from ..parameters import random_regressor
 from .discrepancy import of_known

@@ -8,11 +8,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .. import markup, summaries
+from .. import summaries
+from ..arms import markup
+from ..arms.export import missing_assets
+from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
-from ..export import missing_assets
 from ..meaning import Meaning, meaning, mounted
-from ..mjcf import MjcfSource
 from ..recordings import Recording
 from ..report import Section
 from . import saved

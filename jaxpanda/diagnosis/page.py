@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import summaries
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..effects import AbstractEffect
 from ..report import Figure, Listing, Section, Table, number
 from ..versions import version

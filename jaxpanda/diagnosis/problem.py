@@ -13,7 +13,7 @@ import scipy.linalg
 from jaxtyping import Bool, Float
 
 from .. import signals as signals_
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect, Channels, Stretches, joint_columns
 from ..errors import InputError
 from .bodies import Body, body

@@ -30,12 +30,13 @@ import numpy as np
 import scipy.special
 from jaxtyping import Bool, Float
 
-from .. import markup, summaries
-from ..arm import Arm
+from .. import summaries
+from ..arms import markup
+from ..arms.arm import Arm
+from ..arms.export import missing_assets
+from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
 from ..effects import Motion
-from ..export import missing_assets
-from ..mjcf import MjcfSource
 from ..report import Figure, Section, Table, number
 from . import saved
 from .finding import Finding, Fit

@@ -3,9 +3,10 @@
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from .. import files, markup
+from .. import files
+from ..arms import markup
+from ..arms.export import write_document
 from ..corrected import FILE, KIND, XML, Corrected
-from ..export import write_document
 from .finding import Fit
 
 

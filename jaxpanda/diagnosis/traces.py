@@ -17,10 +17,10 @@ import scipy.signal
 from jaxtyping import Float
 
 from .. import signals as signals_
-from ..arm import Arm
+from ..arms.arm import Arm
+from ..arms.mjcf import SOLIMP, SOLREF
 from ..effects import Channels, Motion, Stretches, masses
 from ..errors import InputError
-from ..mjcf import SOLIMP, SOLREF
 from ..recordings import Recording
 
 WORK_RATE = 100.0

@@ -9,15 +9,15 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from .. import markup
-from ..arm import Arm
+from ..arms import markup
+from ..arms.arm import Arm
+from ..arms.export import ExportResult, edit_mjcf, write_parameters
+from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
 from ..effects import AbstractEffect
 from ..effects.native import nearest
 from ..errors import InputError
-from ..export import ExportResult, edit_mjcf, write_parameters
 from ..feasible.nearest import are_buildable, nearest_buildable
-from ..mjcf import MjcfSource
 from ..recordings import Recording
 from ..validation import torque_rmse
 from .problem import Problem

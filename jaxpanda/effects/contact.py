@@ -10,7 +10,7 @@ import numpy as np
 from jaxpanda_kernels import link_poses
 from jaxtyping import Array, Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from .effect import AbstractArmEffect, Coefficient, Resistance, Shape
 from .load import window
 from .motion import Motion, wrench_columns

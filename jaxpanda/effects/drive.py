@@ -11,7 +11,7 @@ import numpy as np
 from jaxpanda_kernels import mass_matrix
 from jaxtyping import Array, Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Numbers, Shape
 from .friction import CORRECTED
 from .motion import Channels, Joint, Motion

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from .motion import Channels, Motion, filled
 
 Numbers = Float[Array, " n"] | Float[np.ndarray, " n"]

@@ -10,7 +10,7 @@ import numpy as np
 from jaxpanda_kernels import rnea
 from jaxtyping import Array, Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from .effect import AbstractArmEffect, Coefficient, Numbers, Resistance, Shape
 from .motion import Motion
 

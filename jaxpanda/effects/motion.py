@@ -11,7 +11,7 @@ import numpy as np
 from jaxpanda_kernels import batched, link_poses, mass_matrix, regressor, rnea
 from jaxtyping import Array, Float, Int
 
-from ..arm import Arm
+from ..arms.arm import Arm
 
 _CHUNK = 1024
 """Samples that one compiled call takes: recordings of any length share its compilation."""

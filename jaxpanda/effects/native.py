@@ -1,6 +1,6 @@
 """What MuJoCo's joints hold natively, in place of laws that they do not hold."""
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from .drive import JointSpring
 from .effect import AbstractEffect, AbstractJointEffect
 from .friction import CoulombFriction, ViscousFriction

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from .effect import COMMON, AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape, settling
 from .motion import Channels, Joint, Motion
 from .twist import low_passed

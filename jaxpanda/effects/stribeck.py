@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from .effect import (
     AbstractDryFriction,
     AbstractEffect,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from .effect import (
     AbstractDryFriction,
     AbstractInstantEffect,

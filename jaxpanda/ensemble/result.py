@@ -13,17 +13,18 @@ import numpy as np
 from jaxpanda_kernels import inertia, regressor
 from jaxtyping import Array, Float
 
-from .. import markup
-from ..arm import Arm
+from ..arms import markup
+from ..arms.arm import Arm
+from ..arms.export import ExportResult, panda_mjcf, write_parameters
+from ..arms.mjcf import MjcfSource, move_standard
+from ..arms.source import from_document, from_mjcf
 from ..corrected import Corrected
 from ..diagnosis.traces import prepare as prepare_trace
 from ..effects import AbstractJointEffect, Stretches, joint_columns
 from ..errors import InputError
-from ..export import ExportResult, panda_mjcf, write_parameters
 from ..files import Kind, finite, output_folder, settle, write_json, write_npz
 from ..friction import MODELS, Friction
 from ..inputs import read_json, read_npz
-from ..mjcf import MjcfSource, from_document, from_mjcf, move_standard
 from ..recordings import Recording
 from ..signals import prepare
 from ..validation import mjx_package

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..arms.arm import Arm
+from ..arms.source import is_panda
 from ..corrected import FILE as CORRECTED
 from ..corrected import XML, Corrected
 from ..errors import InputError, require_x64
 from ..feasible import Bounds, Constraint, solve
-from ..panda import is_panda, panda
 from ..posterior import Posterior
 from ..retrieval import Retrieval
 from .result import MIXED, Ensemble
@@ -73,7 +74,7 @@ def draw_ensemble(
                 " identify and retrieve again"
             )
         posterior, corrected = links.posterior, None
-        arm = links.model or (panda() if links.arm in ("", "panda") and links.dof == 7 else None)
+        arm = links.model or (Arm.panda() if links.arm in ("", "panda") and links.dof == 7 else None)
         if arm is None:
             raise InputError(f"retrieval: does not hold the arm '{links.arm}'; identify and retrieve again")
         draws = draw(posterior, _of_retrieval(links), count, seed, **options)

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..arms.model_file import Model
 from ..files import output_folder
-from ..model_file import Model
 from ..session import progress
 from .excite import excite
 from .result import KIND, Excitation

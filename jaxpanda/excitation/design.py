@@ -30,7 +30,7 @@ import scipy.linalg
 from jaxpanda_kernels import Chain, regressor
 from jaxtyping import Array, Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..friction import LINEAR, columns
 from ..parameters import Base
 from ..simulation import FourierTrajectory

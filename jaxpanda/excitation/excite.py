@@ -10,14 +10,15 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
+from ..arms.export import panda_mjcf
+from ..arms.markup import parse
+from ..arms.mjcf import MjcfSource
+from ..arms.model_file import Model
+from ..arms.source import from_document, from_mjcf
 from ..errors import InputError, require_x64
-from ..export import panda_mjcf
 from ..friction import LINEAR
 from ..identification import Identification
-from ..markup import parse
-from ..mjcf import MjcfSource, from_document, from_mjcf
-from ..model_file import Model
 from ..parameters import Base, arm_base_parameters
 from ..simulation import FourierTrajectory
 from .design import FRICTION, Criterion, Fourier, Task, friction_columns, gram, rows, solve, starts

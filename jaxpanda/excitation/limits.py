@@ -11,11 +11,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
+from ..arms.mjcf import MjcfSource
 from ..errors import InputError
 from ..files import finite
-from ..mjcf import MjcfSource
-from ..panda import panda
 
 TURNING = {"velocity": 1.5, "acceleration": 5.0, "jerk": 50.0}
 """Of a joint that turns and of which nothing is known [rad/s, rad/s², rad/s³]: what collaborative arms do."""
@@ -112,7 +111,7 @@ def limits_of(arm: Arm, source: MjcfSource, given: Mapping[str, Sequence[float]]
 
 def is_franka_panda(arm: Arm) -> bool:
     """Whether an arm has the Panda's geometry beyond its base, and ranges no other Franka has."""
-    own = panda()
+    own = Arm.panda()
     if arm.dof != own.dof:
         return False
     pairs = (

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..files import Kind, finite, output_folder, write_json, write_text
 from ..parameters import Base
 from ..simulation import FourierTrajectory

@@ -21,10 +21,10 @@ import numpy as np
 from jaxpanda_kernels import Chain, link_poses
 from jaxtyping import Array, Float, Int
 
-from ..arm import Arm
-from ..engine_log import own_log
+from ..arms.arm import Arm
+from ..arms.engine_log import own_log
+from ..arms.mjcf import MjcfSource, with_shapes
 from ..errors import InputError
-from ..mjcf import MjcfSource, with_shapes
 from .limits import is_franka_panda, published
 
 _POSES = 300

@@ -12,9 +12,9 @@ from jaxpanda_kernels import inertia
 from jaxtyping import Float
 
 from .. import inputs
-from ..arm import Arm
+from ..arms.arm import Arm
+from ..arms.source import is_panda
 from ..errors import InputError
-from ..panda import is_panda
 
 INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
 """Order of the six entries of an inertia tensor in tables and files."""

@@ -21,7 +21,7 @@ import numpy as np
 from jaxpanda_kernels import inertia
 from jaxtyping import Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 
 DENSEST = 8960.0
 """Density of copper [kg/m³], the densest material of which joints hold much."""

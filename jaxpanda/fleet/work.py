@@ -22,12 +22,12 @@ import mujoco
 import numpy as np
 
 from .. import inputs
+from ..arms.source import from_mjcf
 from ..convention import PLAIN, Convention
 from ..diagnosis import Diagnosis, diagnose
 from ..diagnosis.knowledge import Knowledge
 from ..errors import InputError
 from ..files import to_json
-from ..mjcf import from_mjcf
 from ..reading import Reading
 from ..recordings import distinct, load_many
 from .levels import estimates

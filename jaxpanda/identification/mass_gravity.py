@@ -23,7 +23,7 @@ from jaxpanda_kernels import Chain, regressor
 from jaxtyping import Array, Float
 
 from .. import inputs
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..errors import InputError, require_x64
 from ..parameters import base_parameters
 from .regression import triangle

@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..feasible import Bounds, Constraint, Solutions, solve
 from ..friction import least_beyond, linear
 from ..parameters import Base

@@ -17,7 +17,7 @@ from jaxpanda_kernels import Chain, regressor
 from jaxtyping import Array, Bool, Float, Int
 from threadpoolctl import threadpool_limits
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..errors import InputError
 from ..friction import columns
 from ..parameters import Base, base_parameters

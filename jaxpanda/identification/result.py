@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..arm import KNOWN, Arm
+from ..arms.arm import KNOWN, Arm
+from ..arms.model_file import WHOLE, Part
 from ..errors import InputError
 from ..files import Kind, finite, output_folder, settle, write_json
 from ..friction import Friction
 from ..inputs import digest, read_json
-from ..model_file import WHOLE, Part
 from ..parameters import coefficient_matrix, expression, linear_forms
 from .condensed import FILE as EVIDENCE_FILE
 from .condensed import Evidence
@@ -73,7 +73,7 @@ class Identification:
     noise: Float[np.ndarray, " dof"] | None = None
     """Noise of the filtered torque [N m] from a motion that repeats itself; no model can explain less."""
     known: Mapping[str, Float[np.ndarray, " dof"]] = dataclasses.field(default_factory=dict)
-    """What the arm's model held beyond rigid links (`jaxpanda.arm.KNOWN`) and was not fitted."""
+    """What the arm's model held beyond rigid links (`jaxpanda.arms.arm.KNOWN`) and was not fitted."""
     evidence: Evidence | None = None
     """The recordings, condensed, where the method is one of motion and torque."""
     arm: str = ""
@@ -248,7 +248,7 @@ class Identification:
 
 
 def known_physics(table: Mapping[str, Any], dof: int, where: str) -> dict[str, Float[np.ndarray, " dof"]]:
-    """The field `known` of a file: one number a joint for each name of `jaxpanda.arm.KNOWN`, or nothing."""
+    """The field `known` of a file: one number a joint for each name of `jaxpanda.arms.arm.KNOWN`, or nothing."""
     reader = _Reader(table, f"{where}: known")
     if table and set(table) != set(KNOWN):
         raise InputError(f"{where}: known holds {', '.join(table)}; {', '.join(KNOWN)} are expected")

@@ -11,7 +11,7 @@ import numpy as np
 from jaxpanda_kernels.batched import mass_matrix
 from jaxtyping import Bool, Float
 
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..errors import InputError, require_x64
 from ..feasible import Bounds, Constraint
 from ..friction import LINEAR, MODELS, Friction, check_model

@@ -4,11 +4,11 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..arms.export import missing_assets
+from ..arms.model_file import Model
 from ..convention import PLAIN, Convention
 from ..errors import InputError
-from ..export import missing_assets
 from ..files import output_folder
-from ..model_file import Model
 from ..reading import Reading
 from ..recordings import load_many
 from .estimate import estimate_payload

@@ -19,7 +19,7 @@ import scipy.ndimage
 from jaxtyping import Float
 
 from .. import signals as signals_
-from ..arm import Arm
+from ..arms.arm import Arm
 from ..effects import Motion
 from ..errors import InputError
 from ..recordings import Recording

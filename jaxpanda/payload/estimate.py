@@ -16,13 +16,14 @@ import numpy as np
 from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
-from ..arm import Arm
+from ..arms.arm import Arm
+from ..arms.export import panda_mjcf
+from ..arms.markup import parse
+from ..arms.mjcf import with_gravity
+from ..arms.model_file import Model
+from ..arms.source import from_document, from_mjcf
 from ..errors import InputError, require_x64
-from ..export import panda_mjcf
 from ..identification import statistics
-from ..markup import parse
-from ..mjcf import from_document, from_mjcf, with_gravity
-from ..model_file import Model
 from ..recordings import Recording, distinct
 from .design import CHANGE, SLOW, Design, Sampled, Scales, design, sample
 from .frame import frame_of

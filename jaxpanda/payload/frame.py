@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ..arms.mjcf import MjcfSource
 from ..errors import InputError
-from ..mjcf import MjcfSource
 
 NAMES = ("flange", "attachment_site", "tool0", "link8", "attachment", "ee_link")
 """What bodies and sites at a flange are called in the files of Panda, UR, Kinova and others, the surest first."""
@@ -24,7 +24,7 @@ class Frame:
     p: Float[np.ndarray, "3"]
     """[m]"""
     R_link: Float[np.ndarray, "3 3"]
-    """The same as a pose in the last link's frame (`jaxpanda.mjcf`), in which dynamics are computed."""
+    """The same as a pose in the last link's frame (`jaxpanda.arms.mjcf`), in which dynamics are computed."""
     p_link: Float[np.ndarray, "3"]
 
     @property

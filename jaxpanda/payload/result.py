@@ -12,12 +12,13 @@ import scipy.stats
 from jaxpanda_kernels import inertia
 from jaxtyping import Float
 
-from .. import markup
+from ..arms import markup
+from ..arms.export import write_document
+from ..arms.mjcf import MjcfSource, move_standard
+from ..arms.source import from_document
 from ..errors import InputError
-from ..export import write_document
 from ..feasible.nearest import are_buildable, nearest_buildable
 from ..files import Kind, output_folder, write_json, write_text
-from ..mjcf import MjcfSource, from_document, move_standard
 from .design import REACH
 from .frame import Frame
 

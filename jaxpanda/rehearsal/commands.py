@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..arms.model_file import Model
 from ..files import output_folder
-from ..model_file import Model
 from ..recordings import load
 from ..session import telling
 from .rehearse import rehearse

@@ -15,21 +15,21 @@ import numpy as np
 from jaxpanda_kernels import inertia
 from jaxtyping import Float
 
-from .. import markup
-from ..arm import Arm
+from ..arms import markup
+from ..arms.arm import Arm
+from ..arms.export import panda_mjcf
+from ..arms.mjcf import MjcfSource
+from ..arms.model_file import Model
+from ..arms.source import from_document, from_mjcf, is_panda
 from ..diagnosis import diagnose as diagnose_
 from ..diagnosis.coverage import least_shown
 from ..diagnosis.premises import pose
 from ..diagnosis.state import start
 from ..diagnosis.traces import prepare as prepare_trace
 from ..errors import InputError, require_x64
-from ..export import panda_mjcf
 from ..feasible.nearest import are_buildable
 from ..identification import identify
 from ..identification.result import RELIABLE
-from ..mjcf import MjcfSource, from_document, from_mjcf
-from ..model_file import Model
-from ..panda import is_panda
 from ..recordings import Recording
 from ..rollout import engine_model
 from ..session import Say, silent

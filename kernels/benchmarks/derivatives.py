@@ -75,10 +75,10 @@ def on_processor(batch: int, note: Callable[[str, float], None], peers: bool) ->
     import jax.numpy as jnp
     from jaxpanda_kernels import columns, derivatives
 
-    from jaxpanda.panda import panda
+    from jaxpanda.arms.arm import Arm
 
     jax.config.update("jax_enable_x64", True)
-    arm, found = panda(), {}
+    arm, found = Arm.panda(), {}
     geometry = columns.specialise(arm.chain)
     zero = jnp.zeros(7)
 
@@ -143,10 +143,10 @@ def agreement(samples: int = 64) -> dict[str, float]:
     import pinocchio
     from jaxpanda_kernels import derivatives
 
-    from jaxpanda.panda import panda
+    from jaxpanda.arms.arm import Arm
 
     jax.config.update("jax_enable_x64", True)
-    arm = panda()
+    arm = Arm.panda()
     model, _ = pinocchio_model(arm)
     data, motion = model.createData(), states(samples, jnp.float64)
     ours = {
@@ -185,10 +185,10 @@ def on_gpu(
     import numpy as np
     from jaxpanda_kernels import columns, derivatives, staging
 
-    from jaxpanda.panda import panda
+    from jaxpanda.arms.arm import Arm
 
     jax.config.update("jax_enable_x64", True)
-    arm = panda()
+    arm = Arm.panda()
     geometry = columns.specialise(arm.chain)
     zero = jnp.zeros(7)
     cpu = jax.default_backend() == "cpu"
@@ -275,7 +275,7 @@ def mjx_peer(rate: Callable, batch: int) -> None:
     import mujoco
     from mujoco import mjx
 
-    from jaxpanda.export import panda_mjcf
+    from jaxpanda.arms.export import panda_mjcf
 
     model = mujoco.MjModel.from_xml_string(panda_mjcf())
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -294,12 +294,12 @@ def mjx_peer(rate: Callable, batch: int) -> None:
 def measure(cores: int, batch: int, rounds: int, folder: Path) -> dict:
     """All contenders on `cores` cores; run in a process of its own."""
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
-    from jaxpanda.panda import panda
+    from jaxpanda.arms.arm import Arm
 
     compilation: dict[str, float] = {}
     contenders = on_processor(batch, compilation.__setitem__, peers=cores != 1)
     if cores == 1:
-        contenders |= pinocchio_loop(folder, pinocchio_model(panda())[1])
+        contenders |= pinocchio_loop(folder, pinocchio_model(Arm.panda())[1])
     samples: dict[str, list] = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, run in contenders.items():

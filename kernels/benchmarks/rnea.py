@@ -128,10 +128,10 @@ def ours(batch: int, note: Callable[[str, float], None], all_forms: bool) -> dic
     import numpy as np
     from jaxpanda_kernels import batched, columns, dynamics
 
-    from jaxpanda.panda import panda
+    from jaxpanda.arms.arm import Arm
 
     jax.config.update("jax_enable_x64", True)
-    arm = panda()
+    arm = Arm.panda()
     geometry = columns.specialise(arm.chain)
     bodies = columns.regrouped(geometry, [[float(v) for v in body] for body in arm.standard])
     rng = np.random.default_rng(0)
@@ -171,9 +171,9 @@ def pinocchio_loops(folder: Path) -> dict[str, Contender]:
     import numpy as np
     import pinocchio
 
-    from jaxpanda.panda import panda
+    from jaxpanda.arms.arm import Arm
 
-    arm = panda()
+    arm = Arm.panda()
     model = pinocchio.Model()
     parent = 0
     numbers = [[arm.dof], np.ravel(arm.chain.gravity)]
@@ -283,10 +283,10 @@ def measure(cores: int, batch: int, rounds: int, folder: Path) -> dict:
     if cores == 0:
         from jaxpanda_kernels import batched, columns
 
-        from jaxpanda.panda import panda
+        from jaxpanda.arms.arm import Arm
 
         rate = copied(batch, rounds)
-        entries = sum(map(len, batched._groups(columns.specialise(panda().chain))))
+        entries = sum(map(len, batched._groups(columns.specialise(Arm.panda().chain))))
         for name, row in rows.items():
             words = {"rnea, columns": 28, "regressor, columns": 21 + entries}.get(name.rpartition(",")[0])
             if words:
@@ -368,7 +368,7 @@ def main() -> None:
         folder = Path(name)
         reasons = {}
         if args.mjx or not args.gpu:
-            from jaxpanda.export import panda_mjcf
+            from jaxpanda.arms.export import panda_mjcf
 
             (folder / "panda.xml").write_text(panda_mjcf())
         if not args.gpu:

@@ -11,7 +11,7 @@ from jaxpanda_kernels import Chain, batched, columns, dynamics
 from jaxpanda_kernels.trigonometry import sincos
 from numpy.testing import assert_allclose
 
-from jaxpanda.panda import panda
+from jaxpanda.arms.arm import Arm
 
 CHAINS = {"panda": None, "chain of 1": (1, 1), "chain of 3": (2, 3)}
 TOLERANCE = {jnp.float64: 1e-12, jnp.float32: 1e-5}
@@ -20,7 +20,7 @@ TOLERANCE = {jnp.float64: 1e-12, jnp.float32: 1e-5}
 @functools.cache
 def arm(name: str) -> tuple[Chain, jax.Array]:
     if name == "panda":
-        return panda().chain, panda().standard
+        return Arm.panda().chain, Arm.panda().standard
     return random_chain(*CHAINS[name]), random_bodies(*CHAINS[name])
 
 

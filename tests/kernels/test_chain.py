@@ -10,7 +10,7 @@ from jaxpanda_kernels import from_modified_dh, link_poses
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from jaxpanda.panda import panda
+from jaxpanda.arms.arm import Arm
 
 POSES = jax.jit(link_poses)
 
@@ -64,7 +64,7 @@ def test_modified_dh_table_places_links_as_elementary_motions_do():
 
 
 def test_a_stretched_panda_stands_where_its_table_says():
-    R, p = link_poses(panda().chain, jnp.zeros(7))
+    R, p = link_poses(Arm.panda().chain, jnp.zeros(7))
     assert_allclose(p[-1], [0.088, 0, 0.333 + 0.316 + 0.384], atol=1e-15)
     assert_allclose(R[-1], Rotation.from_euler("x", 180, degrees=True).as_matrix(), atol=1e-15)
 

@@ -14,7 +14,7 @@ from jaxpanda_kernels import Chain, columns, derivatives
 from jaxpanda_kernels.staging import alone, in_registers
 from numpy.testing import assert_allclose
 
-from jaxpanda.panda import panda
+from jaxpanda.arms.arm import Arm
 
 SAMPLES = 5
 CHAINS = {"one turns": (1, 1), "turn, slide, slide": (3, 3), "panda": None}
@@ -42,7 +42,7 @@ PLAIN_FORWARD = jax.jit(jax.vmap(derivatives.plain_forward, (None, None, 0, 0, 0
 @functools.cache
 def case_of(name: str) -> Case:
     if CHAINS[name] is None:
-        chain, phi = panda().chain, panda().standard
+        chain, phi = Arm.panda().chain, Arm.panda().standard
     else:
         seed, dof = CHAINS[name]
         chain, phi = random_chain(seed, dof), random_bodies(seed, dof)
@@ -186,7 +186,7 @@ def test_parameters_can_be_differentiated_and_mapped():
 
 
 def test_the_panda_has_91_derivatives_beside_its_mass_matrix():
-    arm = columns.specialise(panda().chain)
+    arm = columns.specialise(Arm.panda().chain)
     pairs = [pair for group in derivatives._groups(arm, 3, mass=True) for pair in group]
     assert len(pairs) == len(set(pairs)) == 91 + 28
     assert sum(what == "q" for what, _, _ in pairs) == 42  # turning the base's joint changes nothing

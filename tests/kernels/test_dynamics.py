@@ -23,7 +23,7 @@ from jaxpanda_kernels import (
 )
 from numpy.testing import assert_allclose
 
-from jaxpanda.panda import panda
+from jaxpanda.arms.arm import Arm
 
 ARMS = ["panda", "chain of 1", "chain of 4", "other chain of 4", "chain of 9"]
 SAMPLES = 20
@@ -61,7 +61,7 @@ def terms_of(chain, phi, q, qd, qdd, armature) -> Terms:
 
 def arm(name: str) -> tuple[Chain, jax.Array]:
     if name == "panda":
-        return panda().chain, panda().standard
+        return Arm.panda().chain, Arm.panda().standard
     seed, dof = ARMS.index(name), int(name[-1])
     return random_chain(seed, dof), random_bodies(seed, dof)
 

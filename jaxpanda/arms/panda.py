@@ -1,4 +1,4 @@
-"""The Franka Emika Panda as an `Arm`, and its published values with their source."""
+"""The Franka Emika Panda as it was published, with its source."""
 
 import functools
 import json
@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import from_modified_dh, inertia
 
-from .arm import Arm
-
 
 @functools.cache
 def published() -> dict[str, Any]:
@@ -19,15 +17,8 @@ def published() -> dict[str, Any]:
     return json.loads(resources.files("jaxpanda").joinpath("published/gaz2019.json").read_text("utf-8"))
 
 
-def is_panda(arm: Arm) -> bool:
-    """Whether an arm is the project's own Panda, and not another model of that name."""
-    own = panda()
-    pairs = ((arm.chain.R, own.chain.R), (arm.chain.p, own.chain.p), (arm.standard, own.standard))
-    return all(np.array_equal(a, b) for a, b in pairs)
-
-
-def panda() -> Arm:
-    """The Panda without hand: modified Denavit-Hartenberg table and retrieved parameters of Gaz et al.
+def published_parts() -> dict[str, Any]:
+    """Fields of the `Arm` without hand: modified Denavit-Hartenberg table and retrieved parameters of Gaz et al.
 
     Table VIII with its misprinted c6z corrected, and Table IX. The model holds no friction.
     """
@@ -40,7 +31,7 @@ def panda() -> Arm:
     I_com = np.moveaxis(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), -1, 0)
     mass = jnp.array([link["mass"] for link in table["retrieved_links"]])
     zero = jnp.zeros(dof)
-    return Arm(
+    return dict(
         chain=from_modified_dh(
             jnp.array(dh["a"], float),
             jnp.deg2rad(jnp.array(dh["alpha_degrees"], float)),

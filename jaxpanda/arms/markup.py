@@ -15,8 +15,8 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from . import inputs
-from .errors import InputError
+from .. import inputs
+from ..errors import InputError
 from .model_file import WHOLE, Part
 
 BYTES = 1 << 26

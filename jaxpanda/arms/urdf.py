@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..friction import Friction
 from .arm import Arm
-from .friction import Friction
 from .markup import numbers, quote
 from .mjcf import com_from_standard
 

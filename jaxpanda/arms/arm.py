@@ -9,12 +9,12 @@ import numpy as np
 from jaxpanda_kernels import Chain, rnea
 from jaxtyping import Array, Float
 
+from .mjcf import KNOWN, parts_of, read
 from .model_file import Model
+from .panda import published_parts
 
 FRICTION_LAW = ("friction_rate", "friction_slack")
 """Fields of an `Arm` that say how the friction it holds turns with the velocity; None in both says nothing."""
-KNOWN = ("armature", "damping", "frictionloss", "stiffness", "springref")
-"""Fields of an `Arm` that hold its physics beyond rigid links."""
 NUMBERS = ("standard", *KNOWN, "lower", "upper")
 """Fields of an `Arm` that are arrays of its own."""
 _OPTIONAL = ("lumped", *FRICTION_LAW)
@@ -54,21 +54,17 @@ class Arm(eqx.Module):
 
     @classmethod
     def from_mjcf(cls, path: Model) -> "Arm":
-        """The serial arm in a user's MJCF; `jaxpanda.mjcf` says what can be represented.
+        """The serial arm in a user's MJCF; `jaxpanda.arms.mjcf` says what can be represented.
 
         Raises:
             InputError: the file is no MJCF, or holds something that a serial arm cannot represent.
         """
-        from .mjcf import from_mjcf
-
-        return from_mjcf(path)[0]
+        return cls(**parts_of(read(path))[0])
 
     @classmethod
     def panda(cls) -> "Arm":
-        """The Franka Emika Panda, from published numbers; `jaxpanda.panda` says which."""
-        from .panda import panda
-
-        return panda()
+        """The Franka Emika Panda, from published numbers; `jaxpanda.arms.panda` says which."""
+        return cls(**published_parts())
 
     @property
     def dof(self) -> int:

@@ -27,24 +27,24 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..errors import InputError
+from ..files import Kind, output_folder, write_json, write_text
+from ..friction import Friction
+from ..inputs import read_json
 from . import markup
 from .arm import Arm
-from .errors import InputError
-from .files import Kind, output_folder, write_json, write_text
-from .friction import Friction
-from .inputs import read_json
 from .lint import ignored_by_mjx
 from .markup import numbers
 from .mjcf import (
     MjcfLink,
     MjcfSource,
     com_from_standard,
-    from_document,
     has_own_friction_law,
     move_standard,
     standard_from_com,
 )
-from .panda import panda, published
+from .panda import published
+from .source import from_document
 
 SIDECAR = "jaxpanda.sidecar/1"
 TORQUE_LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
@@ -553,7 +553,7 @@ def panda_mjcf(
         InputError: parameters that are not a real body's.
     """
     with jax.enable_x64(True):
-        arm = jax.tree.map(np.asarray, panda())
+        arm = jax.tree.map(np.asarray, Arm.panda())
     phi = np.asarray(arm.standard if standard is None else standard, float)
     joints = _joint_values(arm, friction)
     timestep = 0.001

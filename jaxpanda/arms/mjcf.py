@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
@@ -26,13 +27,15 @@ import numpy as np
 from jaxpanda_kernels import Chain
 from jaxtyping import Float
 
-from . import inputs, markup
-from .arm import KNOWN, Arm
+from .. import inputs
+from ..errors import InputError
+from . import markup
 from .engine_log import own_log
-from .errors import InputError
-from .model_file import Model, ModelFile, Part, part_of
+from .model_file import Model, Part, part_of
 from .urdf_in import as_mjcf
 
+KNOWN = ("armature", "damping", "frictionloss", "stiffness", "springref")
+"""Fields of an `Arm` that hold its physics beyond rigid links."""
 FINGER_JOINTS = 4
 """Most joints one after another in a finger; longer branches are arms of their own."""
 LEAST_JOINTS = 3
@@ -114,22 +117,6 @@ def read(model: Model) -> markup.Document:
     return as_mjcf(document) if document.root.tag == "robot" else document
 
 
-def from_mjcf(path: Model, gravity: Sequence[float] | None = None) -> tuple[Arm, MjcfSource]:
-    """The serial arm in an MJCF or URDF file, and where its parts stand in it.
-
-    Meshes may be missing where a body has its `inertial`. `gravcomp` is no part of the arm: it is a force of
-    the simulation, while a measured torque carries the weight.
-
-    Args:
-        path: of the file, or which arm of it is meant.
-        gravity: in place of the file's, in the frame of its world [m/s²].
-
-    Raises:
-        InputError: no MJCF, one that MuJoCo refuses, or something that a serial arm cannot represent.
-    """
-    return from_document(with_gravity(read(path), gravity))
-
-
 def with_gravity(document: markup.Document, gravity: Sequence[float] | None) -> markup.Document:
     """The file with this gravity, in the frame of its world [m/s²], or as it is where that is None."""
     if gravity is None:
@@ -144,8 +131,10 @@ def with_gravity(document: markup.Document, gravity: Sequence[float] | None) -> 
     return markup.edit(document, [*edits, *(markup.Edit(flag, {"gravity": None}) for flag in flags)])
 
 
-def from_document(document: markup.Document, dropped: frozenset[int] | None = None) -> tuple[Arm, MjcfSource]:
-    """`from_mjcf` of a text that need not be on disk; names in it are relative to `document.path`.
+def parts_of(
+    document: markup.Document, dropped: frozenset[int] | None = None
+) -> tuple[dict[str, Any], MjcfSource]:
+    """The fields of the `Arm` in a text, which need not be on disk, and where its parts stand there.
 
     Args:
         document: the text.
@@ -164,10 +153,10 @@ def from_document(document: markup.Document, dropped: frozenset[int] | None = No
     _check_joints(model, joints, document.path)
     notes += _notes(model, joints, locked)
     links, chain, standard = _links(model, joints)
-    arm = _arm(model, links, chain, standard, spec.modelname or document.path.stem)
-    _check_finite(arm, document.path)
+    fields = _fields(model, links, chain, standard, spec.modelname or document.path.stem)
+    _check_finite(fields, document.path)
     source = MjcfSource(document, model, dropped, links, standard, bool(spec.compiler.degree), tuple(notes))
-    return arm, source
+    return fields, source
 
 
 @own_log()
@@ -186,18 +175,6 @@ def load_model(path: Model, *, balanceinertia: bool = False) -> mujoco.MjModel:
     _drop_looks(spec, document)
     spec.compiler.balanceinertia |= balanceinertia
     return _compile(spec, document.path)
-
-
-def file_with(arm: Arm, path: str | Path) -> ModelFile:
-    """A file that holds this arm, with what chooses the arm by the names of its joints."""
-    model = load_model(ModelFile(path, Part(outside=True)))
-    names = [model.joint(joint).name for joint in range(model.njnt)]
-    if not set(arm.joint_names) <= set(names):
-        return ModelFile(path)
-    first, last = (int(model.jnt_bodyid[names.index(arm.joint_names[i])]) for i in (0, -1))
-    base = int(model.body_parentid[first])
-    root, tip = (model.body(body).name for body in (base, last))
-    return ModelFile(path, Part(root if base else "", tip if root or not base else "", outside=True))
 
 
 @own_log()
@@ -537,16 +514,17 @@ def _check_joints(model: mujoco.MjModel, joints: list[int], path: Path) -> None:
     _check_loops(model, joints, path)
 
 
-def _check_finite(arm: Arm, path: Path) -> None:
+def _check_finite(fields: dict[str, Any], path: Path) -> None:
     """MuJoCo takes `nan` for a number."""
-    place = jnp.concatenate([arm.chain.R.reshape(-1, 9), arm.chain.p], 1)
-    parts = {"place": place, "inertia": arm.standard} | {name: getattr(arm, name) for name in KNOWN}
+    chain, links = fields["chain"], fields["link_names"]
+    place = jnp.concatenate([chain.R.reshape(-1, 9), chain.p], 1)
+    parts = {"place": place, "inertia": fields["standard"]} | {name: fields[name] for name in KNOWN}
     for what, values in parts.items():
-        bad = np.flatnonzero(~np.isfinite(np.asarray(values)).reshape(arm.dof, -1).all(1))
+        bad = np.flatnonzero(~np.isfinite(np.asarray(values)).reshape(len(links), -1).all(1))
         if len(bad):
-            body, joint = arm.link_names[bad[0]], arm.joint_names[bad[0]]
+            body, joint = links[bad[0]], fields["joint_names"][bad[0]]
             raise InputError(f"{path}: body {body!r} with joint {joint!r}: the {what} is no finite number")
-    if not np.isfinite(np.asarray(arm.chain.gravity)).all():
+    if not np.isfinite(np.asarray(chain.gravity)).all():
         raise InputError(f"{path}: gravity is no finite number")
 
 
@@ -784,7 +762,7 @@ def move_standard(
     return np.concatenate([J[3:, 3], J[:3, 3], I[_ROW, _COLUMN]])
 
 
-def _arm(model, links, chain: Chain, standard: np.ndarray, name: str) -> Arm:
+def _fields(model, links, chain: Chain, standard: np.ndarray, name: str) -> dict[str, Any]:
     joints = [link.joint_id for link in links]
     dofs = [link.dof for link in links]
     limited = model.jnt_limited[joints].astype(bool)
@@ -795,7 +773,7 @@ def _arm(model, links, chain: Chain, standard: np.ndarray, name: str) -> Arm:
     def unless(flag: str, values: np.ndarray):
         return jnp.asarray(np.zeros(len(links)) if _disabled(model, flag) else values)
 
-    return Arm(
+    return dict(
         chain=chain,
         standard=jnp.asarray(standard),
         armature=jnp.asarray(model.dof_armature[dofs]),

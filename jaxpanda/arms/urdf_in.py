@@ -12,9 +12,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from ..errors import InputError
 from . import markup
 from .engine_log import own_log
-from .errors import InputError
 from .markup import numbers, quote
 
 _KINDS = {
