@@ -114,6 +114,8 @@ def test_inspect_prints_one_json_document_and_nothing_else(capsys, recording):
     (one,) = json.loads(out)["recordings"]
     assert one["dof"] == 7
     assert one["rate"] == pytest.approx(1000, rel=1e-3)
+    assert main(["inspect", str(recording), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["recordings"] == [one]
 
 
 def test_the_chain_of_commands_leaves_what_the_interface_promises(capsys, recording, tmp_path):

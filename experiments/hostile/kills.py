@@ -57,7 +57,7 @@ def commands(folder: Path) -> dict[str, tuple[list[str], Path]]:
         "excite": (["--seconds", "5", "--starts", "1", "--no-collisions"], out["excite"]),
         "ensemble": (["--retrieval", str(at["retrieve"]), "--count", "20"], out["ensemble"]),
         "compare": ([str(at["identify"]), str(at["identify"])], out["compare"]),
-        "rehearse": (["--motion", log, "--draws", "1"], out["rehearse"]),
+        "rehearse": (["--motion", log, "--draws", "2"], out["rehearse"]),
         "fleet": ([str(table), "--workers", "0"], out["fleet"]),
         "demo": (["--recording", log, "--starts", "64"], out["demo"]),
     }
