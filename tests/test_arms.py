@@ -197,10 +197,11 @@ def test_a_urdf_is_read_to_the_last_digit(tmp_path):
         (lambda text: text.replace('value="1.2"', 'value="0"').replace('"0.4"', '"0"'), "links 'lower' move"),
         (lambda text: text.replace("</robot>", '<xacro:arm xmlns:xacro="x"/></robot>'), "run xacro"),
         (lambda text: text.replace('child link="lower"', 'child link="lowest"'), "MuJoCo refuses it"),
+        (lambda text: text.replace('ixz="0"', 'ixz="nan"'), "its inertia is no finite number"),
     ],
-    ids=["no inertials", "a link without mass", "xacro", "a link that is not there"],
+    ids=["no inertials", "a link without mass", "xacro", "a link that is not there", "an inertia of nan"],
 )
-def test_a_urdf_without_masses_is_refused_in_a_sentence(change, reason, tmp_path):
+def test_a_urdf_that_is_no_arm_is_refused_in_a_sentence(change, reason, tmp_path):
     said = refused(written(tmp_path, change(URDF), "toy.urdf"))
     assert reason in said
     assert "\n" not in said

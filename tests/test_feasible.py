@@ -270,6 +270,8 @@ def test_inertia_and_total_mass_may_be_absent_from_a_table(tmp_path):
         (GOOD.replace("m1,0,5", "m1,nan,5"), "bounds of m1"),
         (GOOD.replace("m1,0,5", "m1,0,inf"), "must be finite"),
         (GOOD.replace("m1,0,5", "mass1,0,5"), "row 2, column name: 'mass1'"),
+        (GOOD + "m99999999,0,5\n", "row 6, column name: 'm99999999'"),
+        (GOOD + "m0,0,5\n", "row 6, column name: 'm0'"),
         (GOOD.replace("c1z,-1,1\n", ""), "no row for c1z"),
         (GOOD + "m1,0,5\n", "row 6, column name: 'm1' occurs twice"),
         (GOOD + "total_mass,7,8\n", "total_mass"),

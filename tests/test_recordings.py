@@ -93,8 +93,13 @@ def test_saving_replaces_whole_or_not_at_all(tmp_path):
         lambda t: t + "\n\n",
         lambda t: t.replace("time", "TIME").replace("tau_", "Tau_"),
         lambda t: t.replace("q_1,", '"q_1",', 1),
+        lambda t: "# logged on Monday\n# 250 Hz, cell 3\n" + t,
+        lambda t: "# logged on Monday\n# " + t,
     ],
-    ids=["byte-order mark", "CRLF", "spaces", "semicolons", "tabs", "blank lines", "capitals", "quotes"],
+    ids=[
+        *("byte-order mark", "CRLF", "spaces", "semicolons", "tabs", "blank lines", "capitals", "quotes"),
+        *("comments", "comments, the last with the names"),
+    ],
 )
 def test_a_csv_reads_the_same_however_it_is_dressed(tmp_path, disguise):
     (tmp_path / "plain.csv").write_text(text(rows()))
@@ -477,6 +482,7 @@ T = np.arange(1000) * 1e-3
         ({}, "a folder without time stamps"),
         ({"time.txt": T}, "a folder without joint positions"),
         ({"gen_time.txt": T, "positions.txt": motion(T)}, "a folder without time stamps"),
+        ({"a.csv": T, "b.csv": T}, r"a folder of other files \(a.csv and 1 more\), each a recording"),
         (
             {"a_time.txt": T, "b_time.txt": T, "positions.txt": motion(T)},
             "a_time.txt, b_time.txt could each be time",

@@ -58,7 +58,7 @@ def as_mjcf(document: markup.Document) -> markup.Document:
         dropped = _drop_meshes(spec)
         notes += _fix_weightless(spec)
         _require_masses(spec, document)
-        notes += _mend_inertias(spec)
+        notes += _mend_inertias(spec, path)
         spec.compiler.fusestatic = False
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
         try:
@@ -110,7 +110,7 @@ def _weighs(body) -> bool:
     return any(b.mass > 0 for b in _all_below(body))
 
 
-def _mend_inertias(spec: mujoco.MjSpec) -> list[str]:
+def _mend_inertias(spec: mujoco.MjSpec, path: Path) -> list[str]:
     """Let MuJoCo read inertias that are no body's; what is told of each that counts.
 
     A point mass has none, and that of what stands still is no matter. Else the nearest body's is taken: second
@@ -126,6 +126,8 @@ def _mend_inertias(spec: mujoco.MjSpec) -> list[str]:
             continue
         full = np.asarray(body.fullinertia)
         I = full[_TENSOR] if np.isfinite(full[0]) else np.diag(body.inertia)
+        if not np.isfinite(I).all():
+            raise InputError(f"{path}: link {body.name!r}: its inertia is no finite number")
         moments, axes = np.linalg.eigh(np.trace(I) / 2 * np.eye(3) - I)
         total = np.abs(moments).sum()
         if total < mujoco.mjMINVAL:

@@ -163,7 +163,7 @@ def _read_table(path: Path) -> dict[str, tuple[float, float]]:
             r"(m@|c@[xyz]|I@(xx|yy|zz|xy|xz|yz)|total_mass)".replace("@", r"[1-9]\d{0,2}"), name
         ):
             raise InputError(
-                f"{path}: row {number}, column name: '{name}' is none of m1, c1x, I1xx, total_mass"
+                f"{path}: row {number}, column name: '{name[:60]}' is none of m1, c1x, I1xx, total_mass"
             )
         if name in table:
             raise InputError(f"{path}: row {number}, column name: '{name}' occurs twice")
@@ -172,7 +172,8 @@ def _read_table(path: Path) -> dict[str, tuple[float, float]]:
 
 
 def _number(path: Path, number: int, row: dict[str, str | None], column: str) -> float:
+    cell = row[column] or ""
     try:
-        return float(row[column] or "")
+        return float(cell)
     except ValueError:
-        raise InputError(f"{path}: row {number}, column {column}: '{row[column]}' is not a number") from None
+        raise InputError(f"{path}: row {number}, column {column}: '{cell[:60]}' is not a number") from None

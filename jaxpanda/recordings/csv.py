@@ -29,16 +29,14 @@ def read_csv(path: Path, reading: Reading) -> list[Recording]:
     """
     refuse(path.name, reading, "topic", "episode")
     lines = read_text(path).splitlines()
-    start = next(i for i, line in enumerate(lines) if line.strip())
+    start = _header(lines)
     header = lines[start]
     if header.lstrip()[0] in "{[<":
         raise InputError(
             f"{path.name}: JSON or markup, no recording: a CSV with the columns {canonical(7)} is needed"
         )
-    delimiter = max(",;\t", key=header.count)
-    delimiter = delimiter if delimiter in header else None
-    names = [cell.strip().strip("\"'").strip() for cell in header.strip().lstrip("%#").split(delimiter)]
-    headless = len(names) > 1 and all(_is_number(cell) for cell in names)
+    names, delimiter = _cells(header)
+    headless = _are_numbers(names)
     if headless:
         if not {"time", "q"} <= reading.channels().keys():
             raise InputError(
@@ -59,6 +57,25 @@ def read_csv(path: Path, reading: Reading) -> list[Recording]:
         return f"row {i + 1} (line {filled[i]})"
 
     return [recording_of(Table(path, path.name, names, take, row), SOURCES, reading)]
+
+
+def _header(lines: list[str]) -> int:
+    """The first line that is not blank nor a comment; numbers may follow the last comment, which is it then."""
+    filled = [i for i, line in enumerate(lines) if line.strip()]
+    plain = next((i for i in filled if lines[i].lstrip()[0] not in "#%"), filled[-1])
+    comments = [i for i in filled if i < plain]
+    return comments[-1] if comments and _are_numbers(_cells(lines[plain])[0]) else plain
+
+
+def _cells(line: str) -> tuple[list[str], str | None]:
+    """A line taken apart, and what stands between its cells; None for blanks."""
+    delimiter = max(",;\t", key=line.count)
+    between = delimiter if delimiter in line else None
+    return [cell.strip().strip("\"'").strip() for cell in line.strip().lstrip("%#").split(between)], between
+
+
+def _are_numbers(cells: list[str]) -> bool:
+    return len(cells) > 1 and all(_is_number(cell) for cell in cells)
 
 
 def _is_number(cell: str) -> bool:

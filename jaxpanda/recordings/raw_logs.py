@@ -41,6 +41,8 @@ _NOT_MEASURED = {
     "ext",
 }
 _SUFFIX = re.compile(r"\.(txt|dat|log)(\.gz)?$", re.IGNORECASE)
+_ALONE = re.compile(r"\.(csv(\.gz)?|npz|parquet|bag|mcap|db3|h5|hdf5|mat)$", re.IGNORECASE)
+"""Of files that are recordings by themselves."""
 _SLACK = 5  # rows by which the files of one log may differ in length
 
 
@@ -109,10 +111,14 @@ def find_logs(path: Path, columns: Mapping[str, str] | None = None) -> dict[str,
         found[channel] = [path / name]
     for channel in ("time", "q"):
         if not found[channel]:
+            what = "time stamps" if channel == "time" else "joint positions"
+            other = sorted(file.name for file in path.iterdir() if _ALONE.search(file.name))
+            if other:
+                many = f"{other[0]} and {len(other) - 1} more" if len(other) > 1 else other[0]
+                raise InputError(f"{path}: a folder of other files ({many}), each a recording: name those")
             raise InputError(
-                f"{path}: a folder without {'time stamps' if channel == 'time' else 'joint positions'}: "
-                "one-number-a-line logs like …time.txt, …positions.txt, …velocity.txt, …torques.txt (or "
-                ".txt.gz) are needed"
+                f"{path}: a folder without {what}: one-number-a-line logs like …time.txt, …positions.txt, "
+                "…velocity.txt, …torques.txt (or .txt.gz) are needed"
             )
     beginnings = {_beginning(files[0]) for files in found.values() if len(files) == 1}
     chosen = {}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from .. import inputs
-from ..errors import InputError, MissingExtraError
+from ..errors import InputError, MissingExtraError, printable
 from ..reading import Reading
 from . import ur
 from .recording import Recording, Torque
@@ -144,11 +144,11 @@ def _topic(path: Path, bag: Any, reading: Reading) -> tuple[str, str]:
 
 
 def _listed(kinds: dict[str, str]) -> str:
-    return ", ".join(f"{name} ({_short(kind)})" for name, kind in sorted(kinds.items()))
+    return ", ".join(f"{printable(name)} ({_short(kind)})" for name, kind in sorted(kinds.items()))
 
 
 def _short(kind: str) -> str:
-    return kind.replace("/msg/", "/")
+    return printable(kind.replace("/msg/", "/"))
 
 
 def _messages(bag: Any, topic: str) -> Iterator[tuple[int, Any]]:
