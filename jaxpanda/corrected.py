@@ -1,7 +1,6 @@
 """The corrected model: the user's arm, what is now known better of it, and the effects that were missing."""
 
 import dataclasses
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from .effects import (
     sign_over_velocity,
     smooth_torque,
 )
-from .errors import InputError
+from .errors import InputError, reason
 from .inputs import read_json
 
 SCHEMA = "jaxpanda.corrected/1"
@@ -263,9 +262,8 @@ def read(
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        said = textwrap.shorten(str(error), 300)
         raise InputError(
-            f"{path}: is not as `diagnose` writes it ({type(error).__name__}: {said}); diagnose again"
+            f"{path}: is not as `diagnose` writes it ({type(error).__name__}: {reason(error)}); diagnose again"
         ) from None
     return found, noise
 

@@ -1,5 +1,7 @@
 """What can go wrong that is no defect of ours, each one clear sentence."""
 
+import textwrap
+
 
 class InputError(ValueError):
     """Bad input: one clear sentence that says what, where (file, column, row) and what would work.
@@ -34,6 +36,11 @@ def printable(text: str) -> str:
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
     )
+
+
+def reason(error: Exception) -> str:
+    """What a library says, as part of a sentence: on one line, and not longer than one reads."""
+    return printable(textwrap.shorten(str(error), 200, placeholder="…"))
 
 
 def require_x64(stage: str) -> None:

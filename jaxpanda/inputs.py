@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from .errors import InputError
+from .errors import InputError, reason
 
 BYTES = 1 << 29
 """Most that is read of one file, and most that it may unpack to; an hour of a 7-joint arm at 1 kHz is less in any
@@ -209,7 +209,9 @@ def unpacked(content: bytes, path: Path, most: int = BYTES) -> bytes:
                 out += part
                 require_unpacked(path.name, len(content), len(out), most)
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"{path.name}: a broken or truncated gzip file ({error}): copy it again") from None
+        raise InputError(
+            f"{path.name}: a broken or truncated gzip file ({reason(error)}): copy it again"
+        ) from None
     return bytes(out)
 
 
@@ -241,10 +243,12 @@ def read_npz(path: str | Path, most: int = BYTES) -> dict[str, np.ndarray]:
     except InputError:
         raise
     except (ValueError, MemoryError, TypeError) as error:
-        raise InputError(f"{path}: holds no plain arrays ({error}): save numbers only, no objects") from None
+        raise InputError(
+            f"{path}: holds no plain arrays ({reason(error)}): save numbers only, no objects"
+        ) from None
     except Exception as error:  # zip, deflate and header errors have no common class
         raise InputError(
-            f"{path}: no NumPy archive (.npz), or a broken one ({type(error).__name__}: {error})"
+            f"{path}: no NumPy archive (.npz), or a broken one ({type(error).__name__}: {reason(error)})"
         ) from None
     for name, array in found.items():
         if not isinstance(array, np.ndarray):  # a member that is no array comes as bytes

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 from ..arms.arm import Arm
 from ..arms.engine_log import own_log
 from ..arms.mjcf import MjcfSource, with_shapes
-from ..errors import InputError
+from ..errors import InputError, reason
 from .limits import is_franka_panda, published
 
 _POSES = 300
@@ -190,7 +190,7 @@ def scene_of(
         try:
             model = spec.compile()
         except ValueError as error:
-            said = " ".join(str(error).split())
+            said = reason(error)
             raise InputError(
                 f"{source.path}: its geometry cannot be read ({said}); put the meshes there, or leave collisions "
                 "out by --no-collisions"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import inputs
-from ..errors import InputError, MissingExtraError
+from ..errors import InputError, MissingExtraError, reason
 from ..reading import Reading
 from .recording import Recording
 from .table import WIDEST, Source, Table, canonical_names, chosen, recording_of, refuse
@@ -72,8 +72,7 @@ def _telling(name: str) -> Iterator[None]:
     except InputError:
         raise
     except (OSError, LookupError, UnicodeDecodeError, arrow.ArrowException) as error:
-        said = " ".join(str(error).split())[:200]
-        raise InputError(f"{name}: no Parquet file, or a broken one ({said})") from None
+        raise InputError(f"{name}: no Parquet file, or a broken one ({reason(error)})") from None
 
 
 def _opened(file: Path) -> Any:
