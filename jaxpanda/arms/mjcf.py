@@ -152,7 +152,8 @@ def parts_of(
     joints, locked = _serial_joints(model, document.path, document.part)
     _check_joints(model, joints, document.path)
     notes += _notes(model, joints, locked)
-    links, chain, standard = _links(model, joints)
+    with np.errstate(invalid="ignore", over="ignore"):  # of numbers that `_check_finite` refuses
+        links, chain, standard = _links(model, joints)
     fields = _fields(model, links, chain, standard, spec.modelname or document.path.stem)
     _check_finite(fields, document.path)
     source = MjcfSource(document, model, dropped, links, standard, bool(spec.compiler.degree), tuple(notes))
