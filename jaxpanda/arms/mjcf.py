@@ -32,7 +32,7 @@ from ..errors import InputError
 from . import markup
 from .engine_log import own_log
 from .model_file import Model, Part, part_of
-from .urdf_in import as_mjcf
+from .urdf_in import as_mjcf, moves
 
 KNOWN = ("armature", "damping", "frictionloss", "stiffness", "springref")
 """Fields of an `Arm` that hold its physics beyond rigid links."""
@@ -308,16 +308,7 @@ def _gives_inertia(spec: mujoco.MjSpec, geom) -> bool:
     low, high = spec.compiler.inertiagrouprange
     weightless = geom.mass == 0 or (np.isnan(geom.mass) and geom.density == 0)
     explicit = geom.parent.explicitinertial and not always
-    return _moves(geom.parent) and not (explicit or never or weightless or not low <= geom.group <= high)
-
-
-def _moves(body) -> bool:
-    """Whether a joint stands between the body and the world; else its inertia is no matter."""
-    while body is not None:
-        if list(body.joints):
-            return True
-        body = body.parent
-    return False
+    return moves(geom.parent) and not (explicit or never or weightless or not low <= geom.group <= high)
 
 
 def _check_mesh(spec: mujoco.MjSpec, geom, document: markup.Document) -> None:

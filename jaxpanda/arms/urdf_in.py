@@ -120,7 +120,7 @@ def _mend_inertias(spec: mujoco.MjSpec, path: Path) -> list[str]:
     for body in spec.bodies:
         if not body.explicitinertial:
             continue
-        if not _moves(body) or body.mass <= 0:
+        if not moves(body) or body.mass <= 0:
             body.mass, body.explicitinertial, body.fullinertia = 0.0, False, np.full(6, np.nan)
             body.inertia = np.zeros(3)
             continue
@@ -144,7 +144,8 @@ def _mend_inertias(spec: mujoco.MjSpec, path: Path) -> list[str]:
     return [f"the inertia of {named} is no body's: the nearest that is was taken in its place"]
 
 
-def _moves(body) -> bool:
+def moves(body) -> bool:
+    """Whether a joint stands between the body and the world; else its inertia is no matter."""
     while body is not None:
         if list(body.joints):
             return True
