@@ -246,6 +246,47 @@ def test_each_rest_has_a_number_of_its_own():
     assert noise.widened(0, counts) == pytest.approx(0.5 * (rests + 14 * 0.9))
 
 
+def test_whitened_products_take_what_stays_for_a_rest_as_one_number():
+    """Against the inverse of the covariance: of the samples, and of a level in each rest."""
+    rng, rows = np.random.default_rng(3), 90
+    weights, stays = rng.uniform(0.2, 1.0, rows), np.zeros((rows, 1))
+    stays[10:40], stays[41:44], stays[80:90] = 100.0, 4.0, rng.uniform(1.0, 9.0, (10, 1))
+    noise = Noise(np.zeros((1, 3)), np.ones(1), np.ones(1), stays=stays)
+    covariance = np.diag(weights**-2)
+    for rest in (slice(10, 40), slice(41, 44), slice(80, 90)):
+        level = np.zeros(rows)
+        level[rest] = np.sqrt(stays[rest, 0])
+        covariance += np.outer(level, level)
+    x = rng.normal(size=(rows, 4))
+    x[:3] = 0.0  # which have no past
+    found = noise.whiten(x, 0, weights, slice(0, rows))
+    np.testing.assert_allclose(found.T @ found, x.T @ np.linalg.solve(covariance, x), rtol=1e-9)
+    held = np.where(stays[:, 0] == 100, 8.0, 0.0)
+    assert np.sum(noise.whiten(held, 0, weights, slice(0, rows)) ** 2) < 0.65  # 8^2 / 100, not 8^2 a sample
+
+
+def test_what_known_friction_holds_through_a_long_rest_is_no_law_of_its_own():
+    """Nearly its level, for 22 s: of each sample by itself it made a contact or a drift likelier by 500 nats."""
+    level, seconds = 2.0, 30.0
+    arm = dataclasses.replace(Arm.panda(), frictionloss=jnp.zeros(7).at[3].set(level))
+    r = record(33, seconds=seconds)
+    moves = np.clip(np.maximum(4.5 - r.time, r.time - seconds + 3) / 0.5, 0, 1)
+    rng = np.random.default_rng(4)
+    q = r.q.copy()
+    q[:, 3] = -1.5 + 0.5 * np.sin(6 * np.pi * np.cumsum(moves) / len(moves))
+    q += 1e-5 * rng.normal(size=q.shape)
+    motion = prepare(dataclasses.replace(r, q=q, tau=None), Arm.panda(), whole=True).motion
+    torque, speed = (
+        np.stack([np.interp(r.time, motion.time, x) for x in channel.T], 1)
+        for channel in (motion.torque, motion.qd)
+    )
+    torque[:, 3] += np.where(np.abs(speed[:, 3]) > 2e-3, level * np.sign(speed[:, 3]), 0.95 * level)
+    tau, steps = torque + NOISE * rng.normal(size=q.shape), []
+    problem = pose((prepare(dataclasses.replace(r, q=q, tau=tau), arm),), (True,), "exact").problem
+    search(problem, steps)
+    assert not [step for step in steps if step.startswith("add")]
+
+
 def test_the_noise_of_a_joint_takes_what_nothing_explains_yet(damped, quiet):
     before, after = start(damped), believed(damped, ViscousFriction(3), np.array([DAMPING]))[0]
     own = damped.noise(()).sigma

@@ -64,8 +64,17 @@ def test_the_low_pass_by_products_is_the_recursive_one(problem: Problem):
     assert np.max(np.abs(trace.down(x) - expected)) < 1e-9
 
 
+@pytest.fixture(scope="module")
+def rubbing() -> Problem:
+    """With friction that the model has, and that may hold any load where a joint turns."""
+    arm = dataclasses.replace(Arm.panda(), frictionloss=jax.numpy.full(7, 0.5))
+    return pose((prepare(recording(0, 4.0), arm),), (True,), "identified").problem
+
+
 @pytest.mark.parametrize("slow", [None, np.tile([0.98, 0.7], (7, 1))])
-def test_the_scan_gives_each_shape_the_evidence_that_it_has_alone(problem: Problem, slow):
+@pytest.mark.parametrize("which", ["problem", "rubbing"])
+def test_the_scan_gives_each_shape_the_evidence_that_it_has_alone(which, slow, request):
+    problem = request.getfixturevalue(which)
     coulomb = CoulombFriction(3, 0.01)
     terms = (problem.term(coulomb, np.array([0.3])),)
     noise = dataclasses.replace(problem.noise(terms), slow=slow)

@@ -111,8 +111,16 @@ def at_rest(
     return off
 
 
+def known_at_rest(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
+    """The same of the friction that the user's model holds."""
+    level = np.asarray(traces[0].motion.arm.frictionloss)
+    rests = [np.zeros(t.motion.q.shape) if t.unsure is None else t.unsure for t in traces]
+    return np.square(level * np.concatenate(rests))
+
+
 def unresolved_known(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
-    """The same of the friction that the user's model holds; where it rests `Trace.trust` says."""
+    """What the friction that the user's model holds may be off from sample to sample; where it rests
+    `Trace.trust` says."""
     return unresolved(traces, [_known_friction(t) for t in traces])
 
 

@@ -216,17 +216,21 @@ def _binned(
     of the payload, and to $A^\top \Phi$, of this the rows of what acts there. What depends on the joint's noise
     alone is kept."""
     here, trace = problem.whitened_joint(noise, joint, design.terms), problem.traces[r]
+    weights = problem.weights(noise, r, joint)
 
     def split(x: np.ndarray) -> np.ndarray:
         return np.concatenate([x, np.zeros((-len(x) % bins, *x.shape[1:]))]).reshape(-1, bins, *x.shape[1:])
 
+    def turned_back(x: np.ndarray) -> np.ndarray:
+        return noise.settled(_turned_back(noise, joint, x[rows]), joint, weights, rows)
+
     def with_model(A: np.ndarray, F: np.ndarray) -> np.ndarray:
-        return np.swapaxes(split(_turned_back(noise, joint, A[rows])), 1, 2) @ F
+        return np.swapaxes(split(turned_back(A)), 1, 2) @ F
 
     if ("windows", r) not in here.blocks:
         contacts = trace.motion.wrench_columns[:, :, joint].reshape(trace.motion.samples, -1)
         columns = np.concatenate([contacts, payload.over(trace.motion)[:, joint]], 1)
-        F = split(noise.innovations(columns, joint) * problem.weights(noise, r, joint)[:, None])
+        F = split(noise.innovations(columns, joint) * weights[:, None])
         apart = F[:, :, : contacts.shape[1]].reshape(*F.shape[:2], -1, 6).swapaxes(1, 2)
         whole = F[:, :, contacts.shape[1] :]
         grams = apart.swapaxes(2, 3) @ apart, whole.swapaxes(1, 2) @ whole
@@ -241,8 +245,7 @@ def _binned(
                 kept[id(term)] = with_model(A, F)
             products.append((slice(place, place + width), kept[id(term)]))
         place += width
-    left = _turned_back(noise, joint, design.left[joint][rows])
-    b = np.einsum("ts,tsk->tk", split(left), F)
+    b = np.einsum("ts,tsk->tk", split(turned_back(design.left[joint])), F)
     return b, *kept["grams"], products
 
 

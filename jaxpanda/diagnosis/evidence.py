@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import scipy.signal
+import scipy.sparse
 import scipy.special
 from jaxtyping import Bool, Float, Int
 
@@ -45,6 +46,8 @@ class Noise:
     at_rest: Float[np.ndarray, "rows dof"] | None = None
     """Of the variance that `trust` allows for, in that of the noise, what stays the same for as long as a joint
     rests: friction that may carry any load up to its level."""
+    stays: Float[np.ndarray, "rows dof"] | None = None
+    """The same together with what friction of the user's model may carry there."""
     slow: Float[np.ndarray, "dof 2"] | None = None
     """Pole p and zero z of a slow error beside the noise: what is white is $(1 - p L) / (1 - z L)$ of the
     innovations, with L the step back; as good as none where they are equal."""
@@ -56,12 +59,58 @@ class Noise:
         return 1.0 if self.trust is None else self.trust[rows, joint]
 
     def whiten(
-        self, x: Float[np.ndarray, "_time ..."], joint: int, weights: Float[np.ndarray, " _time"]
+        self, x: Float[np.ndarray, "_time ..."], joint: int, weights: Float[np.ndarray, " _time"], rows: slice
     ) -> Float[np.ndarray, "_time ..."]:
-        """x, by what each row weighs, with unit, uncorrelated noise; the first rows are zero."""
-        wide = weights.reshape(-1, *[1] * (x.ndim - 1))
+        """x in some rows, by what each weighs, with unit, uncorrelated noise; the first rows are zero."""
         foretold = np.arange(len(x)) >= self.a.shape[1]
-        return self.level(self.innovations(x, joint) * wide, joint, (weights > 0) & foretold)
+        return self.level(self.weighted(x, joint, weights, rows), joint, (weights > 0) & foretold)
+
+    def weighted(
+        self, x: Float[np.ndarray, "_time ..."], joint: int, weights: Float[np.ndarray, " _time"], rows: slice
+    ) -> Float[np.ndarray, "_time ..."]:
+        """Innovations by what each row weighs, in which what stays for a rest counts as one number."""
+        y = self.innovations(x, joint)
+        y *= weights.reshape(-1, *[1] * (x.ndim - 1))
+        return self._settled(y, joint, weights, rows)
+
+    def settled(
+        self, y: Float[np.ndarray, "_time ..."], joint: int, weights: Float[np.ndarray, " _time"], rows: slice
+    ) -> Float[np.ndarray, "_time ..."]:
+        r"""$(1 + u u^\top)^{-1/2} y$ in each rest, with u the weighted innovations of the error that stays."""
+        return self._settled(y.copy(), joint, weights, rows)
+
+    def _settled(
+        self, y: Float[np.ndarray, "_time ..."], joint: int, weights: Float[np.ndarray, " _time"], rows: slice
+    ) -> Float[np.ndarray, "_time ..."]:
+        rests = self._rests(joint, weights, rows)
+        if rests is not None:
+            at, u = rests
+            here = y[at].reshape(len(at), -1)
+            y[at] -= (u.T @ (u @ here)).reshape(len(at), *y.shape[1:])
+        return y
+
+    def _rests(
+        self, joint: int, weights: Float[np.ndarray, " _time"], rows: slice
+    ) -> tuple[Int[np.ndarray, " resting"], scipy.sparse.csr_array] | None:
+        """Which rows are in rests, and u of each rest there, by the root of what it takes of its own."""
+        key = joint, rows.start, rows.stop
+        if self.stays is None or key in self._held:
+            return self._held.get(key)
+        size = np.sqrt(self.stays[rows, joint])
+        u = self.innovations(self.std[joint] * size, joint) * weights
+        each = [part for part in stretches(size > 0) if np.any(u[part])]
+        at = np.concatenate([np.arange(part.start, part.stop) for part in each] or [np.zeros(0, int)])
+        ends = np.cumsum([0, *(part.stop - part.start for part in each)])
+        power = np.array([u[part] @ u[part] for part in each])
+        share = np.sqrt((1 - 1 / np.sqrt(1 + power)) / power)
+        values = u[at] * np.repeat(share, np.diff(ends))
+        each_row = scipy.sparse.csr_array((values, np.arange(len(at)), ends), shape=(len(each), len(at)))
+        self._held[key] = (at, each_row) if each else None
+        return self._held[key]
+
+    @functools.cached_property
+    def _held(self) -> dict[tuple[int, int, int], tuple[np.ndarray, scipy.sparse.csr_array] | None]:
+        return {}
 
     def level(
         self, y: Float[np.ndarray, "_time ..."], joint: int, counts: Bool[np.ndarray, " _time"]

@@ -184,7 +184,7 @@ def _told(
     def told(one: Problem) -> list[float]:
         row = []
         for pair, before, already in zip(pairs, old, known, strict=True):
-            more = _pair_sums(one, dataclasses.replace(noise, trust=None), pair)
+            more = _pair_sums(one, dataclasses.replace(noise, trust=None, stays=None), pair)
             together = [_added(x, y) for x, y in zip(before, more, strict=True)]
             row.append(_discrimination(pair, together) - already)
         return row

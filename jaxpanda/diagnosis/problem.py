@@ -17,7 +17,7 @@ from ..arms.arm import Arm
 from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect, Channels, Stretches, joint_columns
 from ..errors import InputError
 from .bodies import Body, body
-from .discrepancy import at_rest, of_law, unresolved, unresolved_known
+from .discrepancy import at_rest, known_at_rest, of_law, unresolved, unresolved_known
 from .evidence import Columns, Design, Noise
 from .grid import Grid
 from .host import parallel
@@ -212,7 +212,7 @@ class Problem:
         """Rows of a joint in all recordings, one below the other, with unit noise."""
         parts = []
         for r, x in enumerate(columns):
-            parts.append(noise.whiten(x, joint, self.weights(noise, r, joint)))
+            parts.append(noise.whiten(x, joint, self.weights(noise, r, joint), self.rows[r]))
         return np.concatenate(parts)
 
     def weights(self, noise: Noise, r: int, joint: int) -> Float[np.ndarray, " _time"]:
@@ -496,9 +496,13 @@ class Problem:
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         off = self._known_unresolved + sum(t.unresolved for t in terms if t.unresolved is not None)
         rests = np.zeros_like(off) + sum(t.at_rest for t in terms if t.at_rest is not None)
-        off, rests = off / np.square(std), rests / np.square(std)
+        off, rests, known = (x / np.square(std) for x in (off, rests, self._known_at_rest))
         trust = 1 / np.sqrt(1 + off + rests)
-        return Noise(np.stack(a), np.array(sigma), np.array(std), trust, rests)
+        return Noise(np.stack(a), np.array(sigma), np.array(std), trust, rests, rests + known)
+
+    @functools.cached_property
+    def _known_at_rest(self) -> Float[np.ndarray, "rows dof"]:
+        return known_at_rest(self.traces)
 
     @functools.cached_property
     def _known_unresolved(self) -> Float[np.ndarray, "rows dof"]:

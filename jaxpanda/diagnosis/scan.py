@@ -8,49 +8,22 @@ as the noise of their joint does; then a step costs small matrices only.
 
 import dataclasses
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
-from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, levelled, log_bayes, stretches
+from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
 from .host import parallel
 from .library import Candidates
-from .traces import Trace
 
 if TYPE_CHECKING:
     from .problem import Problem, Term
 
 _SLICE = 1 << 16
 """Numbers whitened at a time: half a megabyte."""
-
-
-def whitened_slices(
-    x: Float[np.ndarray, "rows n"], traces: Sequence[Trace], noise: Noise, joint: int
-) -> Iterator[tuple[slice, Float[np.ndarray, "_some n"]]]:
-    """`Problem.whitened`, a few rows at a time; rows that are zero for want of a past are left out."""
-    a, order, slow = noise.a[joint], noise.a.shape[1], noise.has_slow(joint)
-    step = max(8, _SLICE // max(1, x.shape[1]))
-    start = 0
-    for trace in traces:
-        stop = start + trace.motion.samples
-        weight = trace.weights[:, joint] * noise.trusted(slice(start, stop), joint) / noise.sigma[joint]
-        parts = stretches(weight[order:] > 0) if slow else [slice(0, stop - start - order)]
-        for part in parts:
-            past = None
-            for low in range(start + order + part.start, start + order + part.stop, step):
-                high = min(low + step, start + order + part.stop)
-                y = a[0] * x[low - 1 : high - 1]
-                for k in range(1, order):
-                    y += a[k] * x[low - 1 - k : high - 1 - k]
-                np.subtract(x[low:high], y, out=y)
-                y *= weight[low - start : high - start, None]
-                if slow:
-                    y, past = levelled(y, noise.slow[joint], past)  # pyright: ignore
-                yield slice(low, high), y
-        start = stop
 
 
 @dataclasses.dataclass
@@ -104,17 +77,19 @@ class Block:
         if missing:
             wanted = [here.rows(key) for key in missing]
             M = np.column_stack([w for w in wanted if w is not None])
-            found, grams = np.zeros((M.shape[1], self.x.shape[1])), G is None
-            m = self.x.shape[1] // self.n
-            if G is None:
-                G = np.zeros((self.n, self.n, m))
-            for rows, F in whitened_slices(self.x, problem.traces, noise, self.joint):
-                found += M[rows].T @ F
-                if grams:
-                    each = F.reshape(len(F), self.n, m)
+            x = self.x.reshape(len(self.x), self.n, -1)
+            found = np.zeros((M.shape[1], *x.shape[1:]))
+            grams = np.zeros((self.n, self.n, x.shape[2])) if G is None else None
+            step = max(1, _SLICE // (len(x) * self.n))
+            for low in range(0, x.shape[2], step):
+                some = slice(low, low + step)
+                F = problem.whitened([x[rows, :, some] for rows in problem.rows], noise, self.joint)
+                found[:, :, some] = np.tensordot(M, F, (0, 0))
+                if grams is not None:
                     for i in range(self.n):
                         for k in range(i + 1):
-                            G[i, k] += np.einsum("tm,tm->m", each[:, i], each[:, k])
+                            grams[i, k, some] = np.einsum("tm,tm->m", F[:, i], F[:, k])
+            G, found = grams if G is None else G, found.reshape(len(found), -1)
             splits = np.cumsum([1 if w is None or w.ndim == 1 else w.shape[1] for w in wanted])[:-1]
             kept = kept | dict(zip(missing, np.split(found, splits), strict=True))
             here.blocks[self.key] = G, kept

@@ -88,7 +88,7 @@ def left_over(
     out = []
     for j in range(problem.dof) if joints is None else joints:
         left = enumerate(misfit(problem, terms, x, j))
-        out.append([noise.innovations(y, j) * problem.weights(noise, r, j) for r, y in left])
+        out.append([noise.weighted(y, j, problem.weights(noise, r, j), problem.rows[r]) for r, y in left])
     return out
 
 
