@@ -13,8 +13,18 @@ from jaxpanda.diagnosis.events import ripple
 from jaxpanda.diagnosis.evidence import Design, Noise
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.proposals import grids
-from jaxpanda.diagnosis.search import posterior, search
-from jaxpanda.diagnosis.state import State, evidence, gains, in_noise, places, start, with_terms, without
+from jaxpanda.diagnosis.search import exchange, posterior, prune, search
+from jaxpanda.diagnosis.state import (
+    State,
+    evidence,
+    gains,
+    in_noise,
+    likelier,
+    places,
+    start,
+    with_terms,
+    without,
+)
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import CATALOGUE, neighbours
 from jaxpanda.effects.drive import Armature, JointSpring, TorqueRipple
@@ -265,10 +275,8 @@ def test_whitened_products_take_what_stays_for_a_rest_as_one_number():
     assert np.sum(noise.whiten(held, 0, weights, slice(0, rows)) ** 2) < 0.65  # 8^2 / 100, not 8^2 a sample
 
 
-def test_what_known_friction_holds_through_a_long_rest_is_no_law_of_its_own():
-    """Nearly its level, for 22 s: of each sample by itself it made a contact or a drift likelier by 500 nats."""
-    level, seconds = 2.0, 30.0
-    arm = dataclasses.replace(Arm.panda(), frictionloss=jnp.zeros(7).at[3].set(level))
+def resting(level: float, held: float, seconds: float = 30.0):
+    """A recording in which the fourth joint rests for all but 7 s, held there by so much of its friction."""
     r = record(33, seconds=seconds)
     moves = np.clip(np.maximum(4.5 - r.time, r.time - seconds + 3) / 0.5, 0, 1)
     rng = np.random.default_rng(4)
@@ -276,15 +284,44 @@ def test_what_known_friction_holds_through_a_long_rest_is_no_law_of_its_own():
     q[:, 3] = -1.5 + 0.5 * np.sin(6 * np.pi * np.cumsum(moves) / len(moves))
     q += 1e-5 * rng.normal(size=q.shape)
     motion = prepare(dataclasses.replace(r, q=q, tau=None), Arm.panda(), whole=True).motion
-    torque, speed = (
+    tau, speed = (
         np.stack([np.interp(r.time, motion.time, x) for x in channel.T], 1)
         for channel in (motion.torque, motion.qd)
     )
-    torque[:, 3] += np.where(np.abs(speed[:, 3]) > 2e-3, level * np.sign(speed[:, 3]), 0.95 * level)
-    tau, steps = torque + NOISE * rng.normal(size=q.shape), []
-    problem = pose((prepare(dataclasses.replace(r, q=q, tau=tau), arm),), (True,), "exact").problem
-    search(problem, steps)
+    tau[:, 3] += np.where(np.abs(speed[:, 3]) > 2e-3, level * np.sign(speed[:, 3]), held)
+    return dataclasses.replace(r, q=q, tau=tau + NOISE * rng.normal(size=q.shape))
+
+
+def test_what_known_friction_holds_through_a_long_rest_is_no_law_of_its_own():
+    """Nearly its level, for 22 s: of each sample by itself it made a contact or a drift likelier by 500 nats."""
+    arm, steps = dataclasses.replace(Arm.panda(), frictionloss=jnp.zeros(7).at[3].set(2.0)), []
+    search(pose((prepare(resting(2.0, 1.9), arm),), (True,), "exact").problem, steps)
     assert not [step for step in steps if step.startswith("add")]
+
+
+@pytest.mark.parametrize("held", [0.5, 0.2, -0.3])
+def test_friction_that_holds_a_load_through_a_long_rest_is_friction_alone(held):
+    """What it holds is no offset beside it."""
+    problem = pose((prepare(resting(0.5, held), Arm.panda()),), (True,), "exact").problem
+    (term,) = search(problem).terms
+    assert (term.effect.family, term.effect.joints) == ("friction", (3,))
+
+
+def test_friction_is_neither_exchanged_nor_dropped_for_what_is_less_likely_in_its_own_noise(monkeypatch):
+    """In friction's noise a rest tells little for it: an offset in its place looked likelier, then went."""
+    problem = pose((prepare(resting(0.5, 0.5), Arm.panda()),), (True,), "exact").problem
+    state = with_terms(
+        problem,
+        [problem.term(CoulombFriction(3, 0.003), np.array([0.5]), np.array([0.5]), np.full(7, NOISE))],
+    )
+    offset = problem.term(TorqueOffset(3), np.array([0.5]))
+    other = with_terms(problem, [offset])
+    assert likelier((problem, state), (problem, other)) < 0
+    tempting = lambda *_: ([(1e6, (offset,)), (0.0, (state.terms[0],))], False)
+    monkeypatch.setattr("jaxpanda.diagnosis.search.instead", tempting)
+    monkeypatch.setattr("jaxpanda.diagnosis.search.gains", lambda *_: [-1e6])
+    assert exchange(problem, state, lambda _: None) is state
+    assert prune(problem, state, lambda _: None) is state
 
 
 def test_the_noise_of_a_joint_takes_what_nothing_explains_yet(damped, quiet):

@@ -43,23 +43,6 @@ def test_samples_weigh_less_where_known_friction_has_no_known_sign():
     assert np.all(trace.trust[(t < 1.8) | (t > 4.2), 1:] == 1)  # no friction is known there
 
 
-def test_what_friction_held_at_rest_goes_with_the_distance_from_there():
-    rubs = dataclasses.replace(Arm.panda(), frictionloss=jnp.array([0.5, 0, 0, 0, 0, 0, 0]))
-    trace = prepare(moved(steps()), rubs)
-    t, q = trace.motion.time, trace.motion.q[:, 0]
-    assert np.all(trace.unsure[(t < 1.8) | (t > 4.3), 0] == 1)
-    out = (t > 2.0) & (t < 3.0) & (trace.unsure[:, 0] < 1)
-    let_go = np.log(trace.unsure[out, 0][0] / 0.05) * 0.75e-3  # bristles of 1.5 mrad at most, on the mean
-    travel = np.abs(q[out] - q[out][0])
-    near = (travel > 0) & (travel < 0.9 * let_go)
-    assert near.sum() > 1
-    np.testing.assert_allclose(
-        trace.unsure[out, 0][near], trace.unsure[out, 0][0] * np.exp(-travel[near] / 0.75e-3), rtol=0.05
-    )
-    assert not trace.unsure[out, 0][travel > 1.1 * let_go].any()
-    assert np.all(np.diff(trace.trust[out, 0]) >= 0)
-
-
 def test_samples_weigh_less_where_motion_is_sharper_than_its_filter():
     t = np.arange(int(6 * RATE)) / RATE
     trace = prepare(moved(0.5 * np.abs(np.sin(0.5 * np.pi * t))), Arm.panda())  # speed jumps at 2 s and 4 s

@@ -263,7 +263,7 @@ def foretold(problem: Problem, laws: State, groups: Sequence[Sequence[int]]) -> 
 
     @functools.cache
     def whole(spread: bool) -> Float[np.ndarray, "rows dof"]:
-        return problem.mispredicted(laws.design, spread=spread)
+        return problem.mispredicted(laws.design, [laws.noise], spread=spread)
 
     out = []
     for group in groups:
@@ -272,7 +272,7 @@ def foretold(problem: Problem, laws: State, groups: Sequence[Sequence[int]]) -> 
         rest = laws.design
         for i in sorted(group, reverse=True):
             rest = rest.without(i)
-        out.append(foretelling(problem.mispredicted(rest, spread=spread), whole(spread)))
+        out.append(foretelling(problem.mispredicted(rest, [laws.noise], spread=spread), whole(spread)))
     return out
 
 

@@ -406,10 +406,15 @@ class Problem:
         left = self._mispredicted(design, folds) / noise.std
         return float(np.sum(left**2)), float(np.sum(users[tested] ** 2))
 
-    def mispredicted(self, design: Design, *, spread: bool = False) -> Float[np.ndarray, "rows dof"]:
-        """Torque that a model gets wrong on blocks that its coefficients were not fitted to [N m]; zero in rows
-        that do not count."""
-        return self._mispredicted(design, self.spread_folds if spread else self.folds)
+    def mispredicted(
+        self, design: Design, noises: Sequence[Noise], *, spread: bool = False
+    ) -> Float[np.ndarray, "rows dof"]:
+        """Torque that a model gets wrong on blocks that its coefficients were not fitted to [N m], by what a row
+        weighs in the noises of the models that are compared: where friction of one may hold any load, neither is
+        wrong."""
+        left = self._mispredicted(design, self.spread_folds if spread else self.folds)
+        trusts = [noise.trust for noise in noises if noise.trust is not None]
+        return left * np.min(trusts, 0) if trusts else left
 
     def _mispredicted(self, design: Design, folds: Sequence) -> Float[np.ndarray, "rows dof"]:
         """Not whitened: as whoever takes the model to predict torque would see it, slow errors count in full,

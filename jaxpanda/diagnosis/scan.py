@@ -78,18 +78,18 @@ class Block:
             wanted = [here.rows(key) for key in missing]
             M = np.column_stack([w for w in wanted if w is not None])
             x = self.x.reshape(len(self.x), self.n, -1)
-            found = np.zeros((M.shape[1], *x.shape[1:]))
-            grams = np.zeros((self.n, self.n, x.shape[2])) if G is None else None
+            found, new = np.zeros((M.shape[1], *x.shape[1:])), G is None
+            grams = np.zeros((self.n, self.n, x.shape[2])) if G is None else G
             step = max(1, _SLICE // (len(x) * self.n))
             for low in range(0, x.shape[2], step):
                 some = slice(low, low + step)
                 F = problem.whitened([x[rows, :, some] for rows in problem.rows], noise, self.joint)
                 found[:, :, some] = np.tensordot(M, F, (0, 0))
-                if grams is not None:
+                if new:
                     for i in range(self.n):
                         for k in range(i + 1):
                             grams[i, k, some] = np.einsum("tm,tm->m", F[:, i], F[:, k])
-            G, found = grams if G is None else G, found.reshape(len(found), -1)
+            G, found = grams, found.reshape(len(found), -1)
             splits = np.cumsum([1 if w is None or w.ndim == 1 else w.shape[1] for w in wanted])[:-1]
             kept = kept | dict(zip(missing, np.split(found, splits), strict=True))
             here.blocks[self.key] = G, kept

@@ -196,19 +196,29 @@ def foremost(problem: Problem, state: State, proposals: Sequence[Proposal]) -> l
 
 
 def prune(problem: Problem, state: State, say: Any) -> State:
-    """Drop terms that the others have made needless, the weakest first."""
-    while state.terms:
-        gained = gains(problem, state)
-        weakest = int(np.argmin(gained))
-        if gained[weakest] >= 0:
-            break
-        say(f"drop {name(state.terms[weakest])}: {gained[weakest]:.1f}")
-        state = with_terms(problem, (*state.terms[:weakest], *state.terms[weakest + 1 :]))
-    return state
+    """Drop terms that the others have made needless, the weakest first.
+
+    Friction may hold any load at rest, so that in its noise samples there tell little for it: without it the
+    model must be likelier in a noise of its own.
+    """
+    needed: set[int] = set()
+    while True:
+        gained = {i: g for i, g in enumerate(gains(problem, state)) if id(state.terms[i]) not in needed}
+        weakest = min(gained, key=lambda i: gained[i], default=None)
+        if weakest is None or gained[weakest] >= 0:
+            return state
+        term = state.terms[weakest]
+        fewer = with_terms(problem, (*state.terms[:weakest], *state.terms[weakest + 1 :]))
+        if term.at_rest is not None and likelier((problem, state), (problem, fewer)) < 0:
+            needed.add(id(term))
+            continue
+        say(f"drop {name(term)}: {gained[weakest]:.1f}")
+        state = fewer
 
 
 def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> State:
-    """Put in the place of each term what is likelier there."""
+    """Put in the place of each term what is likelier there, and in a noise of its own: in that of friction, which
+    may hold any load at rest, samples there tell little against what comes in its place."""
     for i in range(len(state.terms)):
         step = Step(state, "exchange", (i,))
         if step.key(free) in problem.tried:
@@ -217,10 +227,13 @@ def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> Sta
         problem.tried.update(step.tried(free, barred, _told(found)))
         own, best = next(gained for gained, terms in found if terms[0] is state.terms[i]), found[0]
         if best[0] > own + BETTER:
+            other = with_terms(problem, (*state.terms[:i], *best[1], *state.terms[i + 1 :]))
+            if likelier((problem, state), (problem, other)) < 0:
+                continue
             if [t.key for t in best[1]] != [state.terms[i].key]:
                 said = ", ".join(map(name, best[1]))
                 say(f"{said} for {name(state.terms[i])}: {best[0]:.1f} for {own:.1f}")
-            state = with_terms(problem, (*state.terms[:i], *best[1], *state.terms[i + 1 :]))
+            state = other
     return state
 
 

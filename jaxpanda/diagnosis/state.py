@@ -234,7 +234,8 @@ def likelier(a: tuple[Problem, State], b: tuple[Problem, State]) -> float:
     in ways that hold nowhere else.
     """
     drifts = any(t.effect.drifts for _, state in (a, b) for t in state.terms)
-    left, other = (problem.mispredicted(state.design, spread=drifts) for problem, state in (a, b))
+    noises = [state.noise for _, state in (a, b)]
+    left, other = (problem.mispredicted(state.design, noises, spread=drifts) for problem, state in (a, b))
     return b[1].score - a[1].score + foretelling(left, other)
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from .. import signals as signals_
 from ..arms.arm import Arm
 from ..arms.mjcf import SOLIMP, SOLREF
-from ..effects import STICKS, Channels, Motion, Stretches, masses
+from ..effects import Channels, Motion, Stretches, masses
 from ..errors import InputError
 from ..recordings import Recording
 
@@ -50,8 +50,6 @@ _REST = 5.0
 _HELD = 0.01
 """Travel of a joint that friction may hold all the time, yielding both ways [rad]: bristles of real gears give
 way by 2 to 4 mrad before they break away."""
-_LET_GO = 0.05
-"""Share of what friction held at rest that no longer counts."""
 _GAP, _NEAR = 3.5, 0.12
 """Missing steps that make a gap, and how far beyond it samples do not count [s]."""
 _BESIDE_GAP, _LEAST_BESIDE = 0.06, 8
@@ -104,8 +102,7 @@ class Trace:
     where the motion is sharper than the filter of q lets through; none where the joint never moves, as friction
     at rest may carry any part of its load, and none where its torque is stuck."""
     unsure: Float[np.ndarray, "time dof"] | None = None
-    """1 where the sign of a joint's velocity cannot be told, as friction at rest may carry any load; as the joint
-    sets out its bristles take that along, and it falls to 0."""
+    """1 where the sign of a joint's velocity cannot be told, else 0: friction at rest may carry any load."""
     stuck: tuple[tuple[int, float, float], ...] = ()
     """Joint, start and stop [s] of stretches in which measured torque repeats itself although it must change."""
 
@@ -229,8 +226,7 @@ def prepare(
     cutoff = min(0.4 * rate / stride, 0.45 * rate)
 
     sign = held_sign(arm, qd[fine], qdd[fine], width) if turning is None else np.tanh(qd[fine] / turning)
-    doubtful = _unsure_sign(position, qd, width + _TURN * np.abs(qdd), cutoff_q, rate)
-    doubtful = _until_let_go(q, doubtful)[fine][kept]
+    doubtful = _unsure_sign(position, qd, width + _TURN * np.abs(qdd), cutoff_q, rate)[fine][kept]
     held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
     held, tau = held_fine[kept], None if rough.tau is None else rough.tau[keep]
     if stride > thin:
@@ -362,19 +358,6 @@ def _unsure_sign(
     unsure = np.abs(qd) < 2 * error + least
     reach = 2 * round(rate * _BESIDE) + 1
     return scipy.ndimage.maximum_filter1d(unsure.astype(float), reach, axis=0)
-
-
-def _until_let_go(
-    q: Float[np.ndarray, "time dof"], unsure: Float[np.ndarray, "time dof"]
-) -> Float[np.ndarray, "time dof"]:
-    r"""1 where the sign is unsure, then $e^{-x / x_s}$ at a distance x from there: of what bristles held at rest
-    beside their level so much is left (Dahl's form; $x_s$ is the mean of the distances over which friction counts
-    as Coulomb's that sticks)."""
-    rows = np.arange(len(q))[:, None]
-    last = np.maximum.accumulate(np.where(unsure > 0, rows, -1), axis=0)
-    travel = np.abs(q - np.take_along_axis(q, np.maximum(last, 0), axis=0))
-    left = np.where(last < 0, 0.0, np.exp(-travel / (0.5 * STICKS)))
-    return np.where(left < _LET_GO, 0.0, left)
 
 
 def _cut_off(
