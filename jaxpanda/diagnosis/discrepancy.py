@@ -104,18 +104,20 @@ def at_rest(
     """Square of what a law may be off for as long as a joint rests [N² m²]: dry friction, by all of it."""
     if not (effect.dry and isinstance(effect, AbstractJointEffect)):
         return None
-    j = effect.joints[0]
-    rests = [np.zeros(t.motion.samples) if t.unsure is None else t.unsure[:, j] for t in traces]
-    off = np.zeros((sum(map(len, rests)), traces[0].motion.dof))
-    off[:, j] = np.square(_level(np.concatenate(torque)[:, j]) * np.concatenate(rests))
+    j, rests = effect.joints[0], _resting(traces)
+    off = np.zeros_like(rests)
+    off[:, j] = np.square(_level(np.concatenate(torque)[:, j]) * rests[:, j])
     return off
 
 
 def known_at_rest(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
     """The same of the friction that the user's model holds."""
-    level = np.asarray(traces[0].motion.arm.frictionloss)
-    rests = [np.zeros(t.motion.q.shape) if t.unsure is None else t.unsure for t in traces]
-    return np.square(level * np.concatenate(rests))
+    return np.square(np.asarray(traces[0].motion.arm.frictionloss) * _resting(traces))
+
+
+def _resting(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
+    """`Trace.unsure` of all recordings, one below the other."""
+    return np.concatenate([np.zeros(t.motion.q.shape) if t.unsure is None else t.unsure for t in traces])
 
 
 def unresolved_known(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:

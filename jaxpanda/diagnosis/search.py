@@ -203,17 +203,21 @@ def prune(problem: Problem, state: State, say: Any) -> State:
     """
     needed: set[int] = set()
     while True:
-        gained = {i: g for i, g in enumerate(gains(problem, state)) if id(state.terms[i]) not in needed}
-        weakest = min(gained, key=lambda i: gained[i], default=None)
-        if weakest is None or gained[weakest] >= 0:
-            return state
-        term = state.terms[weakest]
-        fewer = with_terms(problem, (*state.terms[:weakest], *state.terms[weakest + 1 :]))
-        if term.at_rest is not None and likelier((problem, state), (problem, fewer)) < 0:
+        gained = gains(problem, state)
+        for weakest in np.argsort(gained, kind="stable").tolist():
+            term = state.terms[weakest]
+            if gained[weakest] >= 0:
+                return state
+            if id(term) in needed:
+                continue
+            fewer = with_terms(problem, (*state.terms[:weakest], *state.terms[weakest + 1 :]))
+            if term.at_rest is None or likelier((problem, state), (problem, fewer)) >= 0:
+                say(f"drop {name(term)}: {gained[weakest]:.1f}")
+                state = fewer
+                break
             needed.add(id(term))
-            continue
-        say(f"drop {name(term)}: {gained[weakest]:.1f}")
-        state = fewer
+        else:
+            return state
 
 
 def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> State:
