@@ -20,6 +20,7 @@ from .effects import (
     Channels,
     Motion,
     Stretches,
+    Turn,
     catalogue_with,
     joint_columns,
     sign_over_velocity,
@@ -47,9 +48,9 @@ class Corrected(eqx.Module):
     frictionloss_change: Float[Array, " dof"]
     effects: tuple[AbstractEffect, ...]
     coefficients: tuple[Float[Array, " _n"], ...]
-    turning: float | None = eqx.field(default=None, static=True)
-    """Velocity over which a prediction lets the model's Coulomb friction turn [rad/s], as it did in the
-    recordings; None: as MuJoCo's constraint does."""
+    turns: tuple[Turn | None, ...] = eqx.field(default=(), static=True)
+    """How a prediction lets the model's Coulomb friction turn in each joint, as it did in the recordings; None,
+    or no entries: as MuJoCo's constraint does."""
     cutoffs: tuple[float | None, ...] = eqx.field(default=(), static=True)
     """Up to which a prediction takes motion into account in each joint's torque [Hz], as that of the recordings
     showed it; None, or no entries: as far as q shows it."""
@@ -207,7 +208,7 @@ class Corrected(eqx.Module):
             "change": np.asarray(self.change).tolist(),
             "damping_change": np.asarray(self.damping_change).tolist(),
             "frictionloss_change": np.asarray(self.frictionloss_change).tolist(),
-            "turning": self.turning,
+            "turns": [None if turn is None else {turn.over: turn.size} for turn in self.turns],
             "cutoffs": list(self.cutoffs),
             "effects": [
                 {**effect.to_json(), "coefficients": np.asarray(c).tolist()}
@@ -238,7 +239,7 @@ class Corrected(eqx.Module):
             numbers(document["frictionloss_change"]),
             tuple(found),
             tuple(numbers(e["coefficients"]) for e in document["effects"]),
-            None if document.get("turning") is None else float(document["turning"]),
+            _turns(document),
             tuple(None if x is None else float(x) for x in document.get("cutoffs") or ()),
         )
 
@@ -268,6 +269,16 @@ def read(
     return found, noise
 
 
+def _turns(document: Mapping[str, Any]) -> tuple[Turn | None, ...]:
+    """How friction turns in predictions; `turning`, a speed for all joints, stood in earlier documents."""
+    if document.get("turning") is not None:
+        return (Turn("speed", float(document["turning"])),) * len(document["damping_change"])
+    told = [None if x is None else dict(x).popitem() for x in document.get("turns") or ()]
+    if any(x is not None and x[0] not in ("speed", "distance") for x in told):
+        raise ValueError("turns must be over a speed or a distance")
+    return tuple(None if x is None else Turn(x[0], float(x[1])) for x in told)
+
+
 def _check_numbers(found: Corrected, noise: np.ndarray) -> None:
     arm, n = found.arm, found.arm.dof
     told = [name for name in FRICTION_LAW if getattr(arm, name) is not None]
@@ -283,8 +294,9 @@ def _check_numbers(found: Corrected, noise: np.ndarray) -> None:
             raise ValueError(f"{name} must hold {' x '.join(map(str, shape))} numbers")
     if len(found.cutoffs) not in (0, n) or not all(x is None or 0 < x < np.inf for x in found.cutoffs):
         raise ValueError(f"cutoffs must hold {n} positive numbers")
-    if found.turning is not None and not 0 < found.turning < np.inf:
-        raise ValueError("turning must be a positive number")
+    sizes = [turn.size for turn in found.turns if turn is not None]
+    if len(found.turns) not in (0, n) or not all(0 < x < np.inf for x in sizes):
+        raise ValueError(f"turns must hold {n} positive numbers")
 
 
 class Plant(eqx.Module):

@@ -1,6 +1,7 @@
 """Whether a prediction says of friction at rest and of fast motion what the recordings' torque showed."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,16 +10,20 @@ import scipy.signal
 
 from jaxpanda import Arm, Recording
 from jaxpanda.corrected import Corrected
-from jaxpanda.diagnosis.as_recorded import GEAR, as_recorded, misleading, predicted
+from jaxpanda.diagnosis.as_recorded import as_recorded, misleading, predicted
 from jaxpanda.diagnosis.traces import held_sign, prepare
+from jaxpanda.effects import Turn
 from jaxpanda.effects.drive import Armature
 from jaxpanda.effects.friction import ViscousFriction
 
 NOISE = np.full(7, 0.02)
 
 
-def rubbing(arm: Arm, turning: float | None) -> Recording:
-    """Slow swings of the Panda, whose friction turns over a velocity [rad/s], or as MuJoCo's constraint does."""
+SPEED, BRISTLES = Turn("speed", 0.01), Turn("distance", 1.5e-3)
+
+
+def rubbing(arm: Arm, turns: Sequence[Turn | None]) -> Recording:
+    """Slow swings of the Panda, the friction of each joint turning in its way."""
     rng, time = np.random.default_rng(3), np.arange(0, 8.0, 2e-3)
     phase = 0.7 * time[:, None] + np.arange(7)
     qd = 0.05 * np.cos(phase)
@@ -26,20 +31,47 @@ def rubbing(arm: Arm, turning: float | None) -> Recording:
     frictionless = dataclasses.replace(arm, frictionloss=jnp.zeros(7))
     still = Recording("slow.csv", time, q, tau=np.zeros((len(time), 7)))
     load = prepare(still, frictionless, whole=True, noise=NOISE).motion.torque
-    qdd = -0.05 * 0.7 * np.sin(phase)
-    sign = held_sign(arm, qd, qdd, np.full(7, 1e-6)) if turning is None else np.tanh(qd / turning)
+    sign = held_sign(arm, qd, -0.05 * 0.7 * np.sin(phase), np.full(7, 1e-6))
+    for joint, turn in enumerate(turns):
+        if turn == SPEED:
+            sign[:, joint] = np.tanh(qd[:, joint] / 0.01)
+        elif turn == BRISTLES:
+            sign[:, joint] = dahl(q[:, joint], 1.5e-3, np.sign(qd[0, joint]))
     tau = load + np.asarray(arm.frictionloss) * sign + NOISE * rng.normal(size=q.shape)
     return Recording("slow.csv", time, q, tau=tau)
 
 
-@pytest.mark.parametrize(("true", "told"), [(None, None), (0.02, GEAR)])
-def test_friction_of_the_model_turns_in_predictions_as_it_did_in_the_recordings(true, told):
+def dahl(q: np.ndarray, distance: float, z: float) -> np.ndarray:
+    """Bristles by small steps of dz = (sign(dq) - z) |dq| / distance."""
+    out = [z]
+    for moved in np.diff(q):
+        for _ in range(20):
+            z += (np.sign(moved) - z) * abs(moved) / 20 / distance
+        out.append(z)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("turns", [(), (SPEED,) * 7, (BRISTLES, SPEED, None) * 2 + (BRISTLES,)])
+def test_friction_of_the_model_turns_in_predictions_as_it_did_in_the_recordings(turns):
+    """Each joint's in its own way; the prediction is then right to the noise."""
     arm = dataclasses.replace(Arm.panda(), frictionloss=jnp.full(7, 0.5))
     zeros = jnp.zeros(7)
     corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
-    found = as_recorded([rubbing(arm, true)], corrected, NOISE)
-    assert found.turning == told
-    assert Corrected.from_json(found.to_json()).turning == told
+    recording = rubbing(arm, turns)
+    found = as_recorded([recording], corrected, NOISE)
+    assert found.turns == turns
+    assert Corrected.from_json(found.to_json()).turns == turns
+    error = predicted(recording, found, NOISE)[1] - recording.tau
+    assert np.all(np.std(error, axis=0) < 1.1 * NOISE)
+
+
+def test_a_speed_over_which_friction_turns_in_all_joints_is_still_read():
+    """As earlier versions wrote it."""
+    zeros = jnp.zeros(7)
+    document = Corrected(Arm.panda(), jnp.zeros((7, 10)), zeros, zeros, (), ()).to_json()
+    del document["turns"]
+    assert Corrected.from_json({**document, "turning": 0.01}).turns == (SPEED,) * 7
+    assert Corrected.from_json({**document, "turning": None}).turns == ()
 
 
 def reversing(arm: Arm, filtered: tuple[int, ...], speed: float) -> Recording:
@@ -74,13 +106,13 @@ def test_of_a_long_recording_the_beginning_is_compared(monkeypatch):
     """Friction that turns otherwise in what follows, and is stronger there, decides nothing if left out."""
     arm, zeros = dataclasses.replace(Arm.panda(), frictionloss=jnp.full(7, 0.5)), jnp.zeros(7)
     corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
-    first = rubbing(arm, 0.02)
-    later = rubbing(dataclasses.replace(arm, frictionloss=jnp.full(7, 5.0)), None)
+    first = rubbing(arm, (SPEED,) * 7)
+    later = rubbing(dataclasses.replace(arm, frictionloss=jnp.full(7, 5.0)), ())
     half = len(first.time) // 2
     both = dataclasses.replace(first, tau=np.concatenate([first.tau[:half], later.tau[half:]]))
-    assert as_recorded([both], corrected, NOISE).turning is None
+    assert as_recorded([both], corrected, NOISE).turns != (SPEED,) * 7
     monkeypatch.setattr("jaxpanda.diagnosis.as_recorded.LONG", float(first.time[half - 1]))
-    assert as_recorded([both], corrected, NOISE).turning == GEAR
+    assert as_recorded([both], corrected, NOISE).turns == (SPEED,) * 7
 
 
 def test_torque_of_changed_links_is_that_of_the_regressor():

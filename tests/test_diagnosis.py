@@ -559,7 +559,9 @@ def test_prediction_refuses_a_corrected_arm_that_is_not_whole(tmp_path):
         ({"torque_noise": [1]}, "torque_noise must hold 7 numbers"),
         ({"cutoffs": [5.0]}, "cutoffs must hold 7 positive numbers"),
         ({"cutoffs": [None] * 6 + [-5.0]}, "cutoffs must hold 7 positive numbers"),
-        ({"turning": "nan"}, "turning must be a positive number"),
+        ({"turning": "nan"}, "turns must hold 7 positive numbers"),
+        ({"turns": [{"distance": 1e-3}]}, "turns must hold 7 positive numbers"),
+        ({"turns": [{"time": 1e-3}] * 7}, "turns must be over a speed or a distance"),
     ):
         write_json(tmp_path / "corrected.json", {**document, **broken})
         with pytest.raises(InputError, match=rf"corrected\.json: is not as `diagnose` writes it .*{said}"):

@@ -119,6 +119,19 @@ def test_a_prediction_is_not_shaken_by_a_coarse_encoder():
     assert np.sqrt(np.mean(error**2)) < 0.03  # 0.07 with the filter of a diagnosis
 
 
+def test_a_prediction_keeps_a_fast_motion_in_the_last_second():
+    """Windows of the spectrum that left out what did not fill one put the low-pass below it."""
+    t = np.arange(int(9.8 * RATE)) / RATE
+    late = np.clip(t - 9.0, 0, None)
+    wave = 0.5 * np.sin(2 * np.pi * 0.3 * t) + 0.01 * np.sin(2 * np.pi * 7.0 * late) ** 3
+    one = moved(wave)
+    noisy = dataclasses.replace(one, q=one.q + 5e-5 * np.random.default_rng(1).normal(size=one.q.shape))
+    true = np.gradient(np.gradient(wave, 1 / RATE), 1 / RATE)
+    last = (t > 9.1) & (t < 9.7)
+    error = (predicted_acceleration(noisy) - true[:, None])[last]
+    assert np.sqrt(np.mean(error**2)) < 0.5 * np.std(true[last])
+
+
 def predicted_acceleration(recording: Recording) -> np.ndarray:
     """On the recording's own times [rad/s²]."""
     trace = prepare(recording, Arm.panda(), whole=True)

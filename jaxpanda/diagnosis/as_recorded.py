@@ -1,10 +1,9 @@
 r"""What a prediction has to say of the recordings' torque that a diagnosis need not ask.
 
-Friction at rest: MuJoCo's constraint holds a joint almost without creep; the bristles of a gear yield by some
-mrad. What they do depends on where the joint came from, which few recordings tell, so for them it is
-$\tanh(\dot q/v)$, about their mean over many motions. And how much of fast motion the torque shows: its channel
-may be filtered more than q is. A diagnosis weighs such samples down. A prediction takes of each what is nearer to
-the recordings' torque.
+How friction turns: MuJoCo's constraint holds a joint almost without creep; the bristles of a gear yield by some
+mrad, and what they hold at rest depends on where the joint came from; $\tanh(\dot q/v)$ is about their mean over
+many motions. And how much of fast motion the torque shows: its channel may be filtered more than q is. A
+diagnosis weighs such samples down. A prediction takes of each what is nearest to a joint's recorded torque.
 """
 
 import dataclasses
@@ -14,12 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ..corrected import Corrected
+from ..effects import Turn
 from ..recordings import Recording
 from .traces import Trace, prepare
 
-GEAR = 0.01
-"""Velocity over which the friction of a gear turns [rad/s]."""
-CUTOFFS = (40.0, 30.0, 20.0, 15.0, 10.0, 7.0, 5.0)
+TURNS = (Turn("speed", 0.01), *(Turn("distance", x) for x in (3e-4, 7e-4, 1.5e-3, 3e-3, 6e-3)))
+"""How friction of a gear may turn [rad/s, rad]."""
+CUTOFFS = (40.0, 30.0, 24.0, 20.0, 17.0, 14.0, 12.0, 10.0, 8.5, 7.0, 6.0, 5.0)
 """Low-passes of the motion that are tried [Hz]."""
 LONG = 120.0
 """What of a recording is compared, from its start, at most [s]: more says the same again."""
@@ -32,22 +32,25 @@ def as_recorded(
 ) -> Corrected:
     """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings."""
     recordings = [_beginning(recording) for recording in recordings]
-    best, (measured, torque) = corrected, _compared(recordings, corrected, noise)
-    squares = lambda x: np.maximum(np.sum((measured - x) ** 2, 0), 1e-300)
-    if np.any(np.asarray(corrected.arm.frictionloss + corrected.frictionloss_change)):
-        gear = dataclasses.replace(corrected, turning=GEAR)
-        other = _compared(recordings, gear, noise)[1]
-        if np.sum(np.log(squares(other) / squares(torque))) < 0:
-            best, torque = gear, other
-    slower = []
-    for cutoff in CUTOFFS:
-        everywhere = dataclasses.replace(best, cutoffs=(cutoff,) * corrected.arm.dof)
-        slower.append(squares(_compared(recordings, everywhere, noise)[1]))
-    least = np.min(slower, 0)
+    best = dataclasses.replace(corrected, turns=_turns(recordings, corrected, noise))
+    each = [dataclasses.replace(best, cutoffs=(cutoff,) * corrected.arm.dof) for cutoff in CUTOFFS]
+    slower = [_squares(recordings, one, noise) for one in each]
     # a smaller share may be noise of q, and another motion faster
-    filtered = least < MOST * squares(torque)
+    filtered = np.min(slower, 0) < MOST * _squares(recordings, best, noise)
     cutoffs = [CUTOFFS[k] if low else None for k, low in zip(np.argmin(slower, 0), filtered, strict=True)]
     return dataclasses.replace(best, cutoffs=tuple(cutoffs) if any(filtered) else ())
+
+
+def _turns(
+    recordings: Sequence[Recording], corrected: Corrected, noise: Float[np.ndarray, " dof"]
+) -> tuple[Turn | None, ...]:
+    """How the friction of each joint turned."""
+    if not np.any(np.asarray(corrected.arm.frictionloss + corrected.frictionloss_change)):
+        return ()
+    ways = (None, *TURNS)
+    each = [dataclasses.replace(corrected, turns=(way,) * corrected.arm.dof) for way in ways]
+    nearest = np.argmin([_squares(recordings, one, noise) for one in each], 0)
+    return tuple(ways[k] for k in nearest) if any(nearest) else ()
 
 
 def misleading(
@@ -92,7 +95,7 @@ def predicted(
     cutoffs = corrected.cutoffs or (None,) * corrected.arm.dof
     for cutoff in dict.fromkeys(cutoffs):
         trace = prepare(
-            recording, corrected.arm, whole=True, noise=noise, turning=corrected.turning, below=cutoff
+            recording, corrected.arm, whole=True, noise=noise, turns=corrected.turns, below=cutoff
         )
         out[cutoff] = trace, corrected.measured_torque(trace.motion, trace.channels, trace.sign)
     torque = np.stack([out[cutoff][1][:, joint] for joint, cutoff in enumerate(cutoffs)], 1)
@@ -109,14 +112,13 @@ def _beginning(recording: Recording) -> Recording:
     return dataclasses.replace(recording, **cut, row=None)
 
 
-def _compared(
+def _squares(
     recordings: Sequence[Recording], corrected: Corrected, noise: Float[np.ndarray, " dof"]
-) -> tuple[Float[np.ndarray, "rows dof"], Float[np.ndarray, "rows dof"]]:
-    """Measured and predicted torque of all recordings, without gaps."""
-    both = []
+) -> Float[np.ndarray, " dof"]:
+    """Of the errors of predicted torque in all recordings, without gaps, in sum [N² m²]."""
+    out = np.zeros(corrected.arm.dof)
     for recording in recordings:
         trace, torque = predicted(recording, corrected, noise)
         assert trace.tau is not None
-        both.append((trace.tau[trace.weight > 0], torque[trace.weight > 0]))
-    measured, torque = (np.concatenate(parts) for parts in zip(*both, strict=True))
-    return measured, torque
+        out += np.sum((trace.tau - torque)[trace.weight > 0] ** 2, 0)
+    return out

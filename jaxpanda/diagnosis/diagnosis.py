@@ -349,10 +349,14 @@ def _turned(problem: Problem, state: State) -> list[str]:
 def _as_recorded(corrected: Corrected) -> list[str]:
     """Sentences where predictions differ from MuJoCo's, or take less of the motion than q shows."""
     out = []
-    if corrected.turning is not None:
+    turned = [(j, turn) for j, turn in enumerate(corrected.turns) if turn is not None]
+    if turned:
+        said = ", ".join(
+            f"{turn.size:g} {corrected.arm.unit(turn.unit, j)} at joint {j + 1}" for j, turn in turned
+        )
         out.append(
-            f"`predict` turns the model's Coulomb friction over {corrected.turning:g} rad/s, which is nearer to"
-            " the recordings than MuJoCo's constraint, by which corrected.xml and simulations turn it"
+            f"`predict` turns the model's Coulomb friction over {said}, which is nearer to the recordings than"
+            " MuJoCo's constraint, by which corrected.xml and simulations turn it"
         )
     low = {j + 1: cutoff for j, cutoff in enumerate(corrected.cutoffs) if cutoff is not None}
     if low:

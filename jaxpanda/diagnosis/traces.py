@@ -8,6 +8,7 @@ the cutoff of the torque: an autoregressive noise model on samples closer than t
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,7 +20,7 @@ from jaxtyping import Float
 from .. import signals as signals_
 from ..arms.arm import Arm
 from ..arms.mjcf import SOLIMP, SOLREF
-from ..effects import Channels, Motion, Stretches, masses
+from ..effects import Channels, Motion, Stretches, Turn, masses
 from ..errors import InputError
 from ..recordings import Recording
 
@@ -186,7 +187,7 @@ def prepare(
     *,
     whole: bool = False,
     noise: Float[np.ndarray, " dof"] | None = None,
-    turning: float | None = None,
+    turns: Sequence[Turn | None] = (),
     below: float | None = None,
     coarse: float = WORK_RATE,
 ) -> Trace:
@@ -197,7 +198,7 @@ def prepare(
         arm: whose nominal torque is to be compared.
         whole: one grid for all, ends and gaps included, as prediction needs.
         noise: of the torque [N m], where the recording does not tell.
-        turning: velocity over which the arm's Coulomb friction turns [rad/s]; None: as MuJoCo's constraint does.
+        turns: how each joint's Coulomb friction turns; None, or no entries: as MuJoCo's constraint does.
         below: low-pass of q, where that is lower than what q shows [Hz].
         coarse: rate of the coarse grid, at most; motion above 0.4 of it is left out, as in the torque [Hz].
     """
@@ -225,7 +226,10 @@ def prepare(
     kept, dt = (keep - fine[0]) // thin, thin / rate
     cutoff = min(0.4 * rate / stride, 0.45 * rate)
 
-    sign = held_sign(arm, qd[fine], qdd[fine], width) if turning is None else np.tanh(qd[fine] / turning)
+    sign = held_sign(arm, qd[fine], qdd[fine], width)
+    for joint, turn in enumerate(turns):
+        if turn is not None:
+            sign[:, joint] = turn.share(q[fine, joint], qd[fine, joint])
     doubtful = _unsure_sign(position, qd, width + _TURN * np.abs(qdd), cutoff_q, rate)[fine][kept]
     held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
     held, tau = held_fine[kept], None if rough.tau is None else rough.tau[keep]
@@ -434,9 +438,14 @@ def _clearest_cutoff(
     """
     M = np.diag(masses(arm, q.mean(0)[None])[0])
 
+    # whole half windows, and mirrored beyond the ends: every instant counts, the last ones too
+    count = len(q) - 2
+    window = 2 * (count // max(2, math.ceil(2 * count / (_WINDOW * rate))))
+
     def spectrum(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        window = min(len(x) - 2, round(_WINDOW * rate))
-        return scipy.signal.welch(np.diff(x, n=2, axis=0) * rate**2, rate, nperseg=window, axis=0)
+        qdd = np.diff(x, n=2, axis=0) * rate**2
+        qdd = np.pad(qdd, ((window // 2, window // 2), (0, 0)), "symmetric")
+        return scipy.signal.welch(qdd, rate, nperseg=window, axis=0)
 
     f, power = spectrum(q)
     smooth = signals_.zero_phase(q, _SMOOTH, rate)

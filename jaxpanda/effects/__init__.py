@@ -16,6 +16,7 @@ from .effect import Stretches as Stretches
 from .effect import joint_columns as joint_columns
 from .effect import neighbours as neighbours
 from .effect import sign_over_velocity as sign_over_velocity
+from .memory import Turn as Turn
 from .memory import turns as turns
 from .motion import Channels as Channels
 from .motion import Motion as Motion

@@ -1,10 +1,12 @@
 """Friction with memory around reversals, and the backlash of a gear."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Float
 
 from ..arms.arm import Arm
@@ -156,6 +158,32 @@ def bristle(z: Float[Array, " states"], moved: Float[Array, ""]) -> Float[Array,
 def turned(qd: Float[Array, ""]) -> Float[Array, ""]:
     """What bristles are taken for at the first instant: turned all the way, unless the joint is at rest."""
     return smooth_sign(qd, 0.01)
+
+
+class Turn(NamedTuple):
+    """How the dry friction of a joint turns at a reversal."""
+
+    over: Literal["speed", "distance"]
+    """What it is a matter of: tanh of the velocity over `size`, or Dahl's bristles."""
+    size: float
+    """In `unit`."""
+
+    @property
+    def unit(self) -> str:
+        return {"speed": "rad/s", "distance": "rad"}[self.over]
+
+    def share(
+        self, q: Float[np.ndarray, " time"], qd: Float[np.ndarray, " time"]
+    ) -> Float[np.ndarray, " time"]:
+        """Of the level, at each instant, -1 to 1."""
+        if self.over == "speed":
+            return np.tanh(qd / self.size)
+        moved = np.diff(q) / self.size
+        kept = np.exp(-np.abs(moved))
+        bands = np.ones((2, len(q)))
+        bands[1, :-1] = -kept
+        gained = np.concatenate([[float(turned(jnp.asarray(qd[0])))], np.sign(moved) * (1 - kept)])
+        return scipy.linalg.solve_banded((1, 0), bands, gained)
 
 
 _WIDTH = 0.005
