@@ -289,6 +289,24 @@ def test_whitened_products_take_what_stays_for_a_rest_as_one_number():
     assert np.sum(noise.whiten(held, 0, weights, slice(0, rows)) ** 2) < 0.65  # 8^2 / 100, not 8^2 a sample
 
 
+def test_products_with_what_is_whitened_are_those_of_the_transposed_with_what_is_not():
+    rng, rows = np.random.default_rng(5), 120
+    weights = rng.uniform(0.2, 1.0, rows) * (np.arange(rows) % 50 != 0)
+    stays = np.zeros((rows, 1))
+    stays[20:60], stays[90:95] = 100.0, 4.0
+    a, slow = np.array([[0.6, -0.2, 0.1]]), np.array([[0.99, 0.9]])
+    x, y = rng.normal(size=(rows, 3)), rng.normal(size=(rows, 2))
+    for noise in (
+        Noise(a, np.full(1, 0.3), np.ones(1)),
+        Noise(a, np.full(1, 0.3), np.ones(1), stays=stays),
+        Noise(a, np.full(1, 0.3), np.ones(1), stays=stays, slow=slow),
+    ):
+        here = 0, weights, slice(0, rows)
+        np.testing.assert_allclose(
+            noise.whiten(x, *here).T @ y, x.T @ noise.transposed(y, *here), rtol=1e-9, atol=1e-12
+        )
+
+
 def resting(level: float, held: float, seconds: float = 30.0):
     """A recording in which the fourth joint rests for all but 7 s, held there by so much of its friction."""
     r = record(33, seconds=seconds)

@@ -62,8 +62,28 @@ class Noise:
         self, x: Float[np.ndarray, "_time ..."], joint: int, weights: Float[np.ndarray, " _time"], rows: slice
     ) -> Float[np.ndarray, "_time ..."]:
         """x in some rows, by what each weighs, with unit, uncorrelated noise; the first rows are zero."""
-        foretold = np.arange(len(x)) >= self.a.shape[1]
-        return self.level(self.weighted(x, joint, weights, rows), joint, (weights > 0) & foretold)
+        return self.level(self.weighted(x, joint, weights, rows), joint, self._tells(weights))
+
+    def transposed(
+        self, x: Float[np.ndarray, "_time ..."], joint: int, weights: Float[np.ndarray, " _time"], rows: slice
+    ) -> Float[np.ndarray, "_time ..."]:
+        r"""$W^\top x$ with W what `whiten` does: $(W y)^\top x = y^\top (W^\top x)$."""
+        y = x.copy()
+        if self.has_slow(joint):
+            y[:] = 0.0
+            for part in stretches(self._tells(weights)):
+                y[part] = levelled(x[part][::-1], self.slow[joint])[0][::-1]  # pyright: ignore
+        y = self._settled(y, joint, weights, rows) * weights.reshape(-1, *[1] * (x.ndim - 1))
+        a = self.a[joint]
+        y[: len(a)] = 0.0
+        out = y.copy()
+        for k in range(len(a)):
+            out[: len(x) - 1 - k] -= a[k] * y[k + 1 :]
+        return out / self.sigma[joint]
+
+    def _tells(self, weights: Float[np.ndarray, " _time"]) -> Bool[np.ndarray, " _time"]:
+        """Rows that count, and whose past foretells something of them."""
+        return (weights > 0) & (np.arange(len(weights)) >= self.a.shape[1])
 
     def weighted(
         self, x: Float[np.ndarray, "_time ..."], joint: int, weights: Float[np.ndarray, " _time"], rows: slice

@@ -282,10 +282,23 @@ class Problem:
                 here.terms[id(term)] = term, rows
         return here
 
+    def transposed(self, noise: Noise, joint: int, here: Whitened, key: Any) -> Float[np.ndarray, "rows n"]:
+        """`Noise.transposed` of rows in a joint; of those that come in many products it is kept."""
+        if key not in here.transposed:
+            x = here.rows(key)
+            assert x is not None
+            parts = [
+                noise.transposed(x[rows], joint, self.weights(noise, r, joint), rows)
+                for r, rows in enumerate(self.rows)
+            ]
+            here.transposed[key] = np.concatenate(parts).reshape(len(x), -1)
+        return here.transposed[key]
+
     def forget(self, term: Term) -> None:
         """Give back what was kept of a term that was tried: a search tries thousands."""
         for here in self._joints.values():
             _, rows = here.terms.pop(id(term), (term, None))
+            here.transposed.pop(id(term), None)
             if rows is not None:
                 here.products = {k: v for k, v in here.products.items() if id(term) not in k}
                 for _, kept in here.blocks.values():

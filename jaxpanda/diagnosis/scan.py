@@ -38,6 +38,8 @@ class Whitened:
     )
     """By identity; None where a term does not act in the joint."""
     products: dict[tuple, np.ndarray] = dataclasses.field(default_factory=dict)
+    transposed: dict[Any, Float[np.ndarray, "rows n"]] = dataclasses.field(default_factory=dict)
+    """`Noise.transposed` of the rows."""
     blocks: dict[Any, tuple[np.ndarray, dict]] = dataclasses.field(default_factory=dict)
     """For each block of candidates its Gram matrices, and its products by what they are with."""
 
@@ -74,27 +76,27 @@ class Block:
         acting = [id(t) for t in design.terms if here.terms[id(t)][1] is not None]
         G, kept = here.blocks.get(self.key, (None, {}))
         missing = [key for key in ("residual", "nuisance", *acting) if key not in kept]
+        if G is None:
+            G = self._grams(problem, noise)
         if missing:
-            wanted = [here.rows(key) for key in missing]
-            M = np.column_stack([w for w in wanted if w is not None])
-            x = self.x.reshape(len(self.x), self.n, -1)
-            found, new = np.zeros((M.shape[1], *x.shape[1:])), G is None
-            grams = np.zeros((self.n, self.n, x.shape[2])) if G is None else G
-            step = max(1, _SLICE // (len(x) * self.n))
-            for low in range(0, x.shape[2], step):
-                some = slice(low, low + step)
-                F = problem.whitened([x[rows, :, some] for rows in problem.rows], noise, self.joint)
-                found[:, :, some] = np.tensordot(M, F, (0, 0))
-                if new:
-                    for i in range(self.n):
-                        for k in range(i + 1):
-                            grams[i, k, some] = np.einsum("tm,tm->m", F[:, i], F[:, k])
-            G, found = grams, found.reshape(len(found), -1)
-            splits = np.cumsum([1 if w is None or w.ndim == 1 else w.shape[1] for w in wanted])[:-1]
+            wanted = [problem.transposed(noise, self.joint, here, key) for key in missing]
+            found = np.concatenate(wanted, 1).T @ self.x
+            splits = np.cumsum([w.shape[1] for w in wanted])[:-1]
             kept = kept | dict(zip(missing, np.split(found, splits), strict=True))
             here.blocks[self.key] = G, kept
-        assert G is not None
         return G, kept["residual"][0], np.concatenate([kept[key] for key in ("nuisance", *acting)])
+
+    def _grams(self, problem: "Problem", noise: Noise) -> Float[np.ndarray, "n n m"]:
+        x = self.x.reshape(len(self.x), self.n, -1)
+        out = np.zeros((self.n, self.n, x.shape[2]))
+        step = max(1, _SLICE // (len(x) * self.n))
+        for low in range(0, x.shape[2], step):
+            some = slice(low, low + step)
+            F = problem.whitened([x[rows, :, some] for rows in problem.rows], noise, self.joint)
+            for i in range(self.n):
+                for k in range(i + 1):
+                    out[i, k, some] = np.einsum("tm,tm->m", F[:, i], F[:, k])
+        return out
 
 
 def projected(
