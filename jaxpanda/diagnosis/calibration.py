@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from .finding import Finding, Fit
 
-WEIGHTS = (-1.12, 0.05, 0.56, 2.55, 0.89, -1.32)
+WEIGHTS = (-0.92, 0.13, 0.09, 2.38, 0.72, -0.82)
 """$w_0 \\ldots w_5$."""
 SUREST = 0.995
 """No finding is surer."""
