@@ -175,20 +175,6 @@ def test_dry_friction_is_not_known_where_its_joint_rests(quiet):
     assert at_rest([trace], ViscousFriction(3), torque) is None
 
 
-def test_laws_of_a_joint_hold_at_rest_what_they_come_to_together(quiet):
-    """1.5 N·m less 0.5 are one friction of 1 N·m."""
-    trace = dataclasses.replace(quiet.traces[0], unsure=np.ones((quiet.traces[0].motion.samples, 7)))
-    problem = dataclasses.replace(quiet, traces=(trace,))
-    std = np.full(7, NOISE)
-
-    def stays(*levels: float) -> np.ndarray:
-        law, wide = CoulombFriction(3, 0.001), np.ones(1)
-        return problem.noise([problem.term(law, wide, np.array([x]), std) for x in levels]).stays[:, 3]
-
-    np.testing.assert_allclose(stays(1.5, -0.5), stays(1.0), rtol=1e-3)
-    np.testing.assert_allclose(stays(0.5, 0.5), stays(1.0), rtol=1e-3)
-
-
 def test_two_hundredths_of_a_strong_law_that_vary_with_speed_are_no_second_effect(damped):
     """Believed to the last digit, the damping left what would be called another friction."""
     state, exact = believed(damped, ViscousFriction(3), np.array([DAMPING]))

@@ -101,19 +101,17 @@ def unresolved(traces: Sequence[Trace], torque: Torque) -> Float[np.ndarray, "ro
 def at_rest(
     traces: Sequence[Trace], effect: AbstractEffect, torque: Torque
 ) -> Float[np.ndarray, "rows dof"] | None:
-    """What a law may be off for as long as a joint rests [N m]: dry friction, by all of it. Several laws of a
-    joint are one friction, which holds what they come to together; less than zero is what one takes off."""
+    """Square of what a law may be off for as long as a joint rests [N² m²]: dry friction, by all of it."""
     if not (effect.dry and isinstance(effect, AbstractJointEffect)):
         return None
     j, rests = effect.joints[0], _resting(traces)
-    tau, qd = (np.concatenate(x)[:, j] for x in (torque, [t.motion.qd for t in traces]))
     off = np.zeros_like(rests)
-    off[:, j] = np.copysign(_level(tau), tau @ qd) * rests[:, j]
+    off[:, j] = np.square(_level(np.concatenate(torque)[:, j]) * rests[:, j])
     return off
 
 
 def known_at_rest(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
-    """The square of the same, of the friction that the user's model holds [N² m²]."""
+    """The same of the friction that the user's model holds."""
     return np.square(np.asarray(traces[0].motion.arm.frictionloss) * _resting(traces))
 
 

@@ -46,7 +46,7 @@ class Term:
     unresolved: Float[np.ndarray, "rows dof"] | None = None
     """Square of what it may be off from sample to sample, which no column describes [N² m²]."""
     at_rest: Float[np.ndarray, "rows dof"] | None = None
-    """What it may be off for as long as a joint rests, together with others [N m]."""
+    """Square of what it may be off for as long as a joint rests, likewise [N² m²]."""
     prior: float = 0.0
     """Logarithm of its prior odds, less what the search over its shapes has cost [nats]."""
 
@@ -513,7 +513,7 @@ class Problem:
             )
         a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
         off = self._known_unresolved + sum(t.unresolved for t in terms if t.unresolved is not None)
-        rests = np.square(np.zeros_like(off) + sum(t.at_rest for t in terms if t.at_rest is not None))
+        rests = np.zeros_like(off) + sum(t.at_rest for t in terms if t.at_rest is not None)
         off, rests, known = (x / np.square(std) for x in (off, rests, self._known_at_rest))
         trust = 1 / np.sqrt(1 + off + rests)
         return Noise(np.stack(a), np.array(sigma), np.array(std), trust, rests, rests + known)
