@@ -40,7 +40,7 @@ REFITTED = 0.9
 def findings(
     problem: Problem, searched: State, state: State, laws: State, lost: Sequence[bool]
 ) -> list[Finding]:
-    """The accepted terms as findings, those that explain most first.
+    """The accepted terms as findings, those first that explain most torque, in the noise of its joint.
 
     Args:
         problem: the recordings.
@@ -63,7 +63,8 @@ def findings(
     lowest = {"lowest": problem.traces[0].cutoff} if out else {}
     halted = stuck(problem, state.noise.std)
     unnamed = hum([t.signals for t in problem.traces], problem.active, state.noise.std, **lowest)
-    out = sorted(out, key=lambda f: -f.evidence) + [f for f in (halted, unnamed) if f is not None]
+    explained = lambda f: float(np.sum(np.square(f.rms_torque / state.noise.std)))
+    out = sorted(out, key=explained, reverse=True) + [f for f in (halted, unnamed) if f is not None]
     return out + standing_off(problem, state, {j for f in out for j in f.joints})
 
 
