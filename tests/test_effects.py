@@ -65,7 +65,8 @@ def channels(motion: Motion) -> Channels:
 def shapes(arm: Arm):
     """One shape of every form of every effect, those that only a scan proposes included."""
     proposed = [
-        StribeckBristles(3, 0.1, 2e-3, 1.5),
+        StribeckBristles(3, 0.1, 2e-3, 1.5, "bristles"),
+        StribeckBristles(3, 0.1, 2e-3, 1.5, "lugre"),
         TorqueRipple(1, 20.0, "one"),
         TorqueRipple(1, 20.0, "two"),
         JointSpring(3, "slack", -1.5, 0.05),

@@ -13,12 +13,14 @@ from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.diagnosis.uncertainty import covariances, polished
 from jaxpanda.effects import AbstractEffect, Motion
 from jaxpanda.effects.drive import TorqueRipple
-from jaxpanda.effects.stribeck import StribeckFriction
+from jaxpanda.effects.memory import PreslidingHysteresis
+from jaxpanda.effects.stribeck import StribeckBristles, StribeckFriction
 
 ARM = Arm.panda()
 NOISE, CORRELATED = 0.05, 0.9
 COULOMB, EXCESS, VELOCITY = 0.2, 0.25, 0.1
 AMPLITUDE, ORDER = 0.1, 101.0
+REACH = 4e-3
 
 
 def recording(seed: int, law) -> Recording:
@@ -40,13 +42,43 @@ def ripple(q, qd):
     return AMPLITUDE * np.sin(ORDER * q)
 
 
-def fitted(seed: int, law, effect: AbstractEffect) -> dict[str, tuple[float, float]]:
-    """Value and deviation of each parameter, the effect's shape sought from near the truth."""
-    problem = pose((prepare(recording(seed, law), ARM),), (True,), "exact").problem
+def lugre(q, qd):
+    """Five times that, through damped bristles that break away after 4 mrad at most: LuGre's own equations, in
+    small steps."""
+    most, stiff = 5 * (COULOMB + EXCESS), 5 * (COULOMB + EXCESS) / REACH
+    z, out = 0.0, np.zeros_like(q)
+    for i, v in enumerate(qd):
+        level = most - 5 * EXCESS * (1 - np.exp(-((v / VELOCITY) ** 2)))
+        for _ in range(100):
+            rate = v - stiff * abs(v) / level * z
+            z += rate * 0.005 / 100
+        out[i] = stiff * z + 20.0 * rate
+    return out
+
+
+def found_from(effect: AbstractEffect, problem) -> Proposal:
+    """What a refinement makes of it beside nothing."""
     nothing = start(problem)
     value, deviation = score(problem, nothing.design, nothing.noise, [effect])
     first = Proposal(effect, float(value[0]), float(value[0]), deviation[0], first_steps(effect))
-    best = refine(problem, nothing.design, nothing.noise, first)
+    return refine(problem, nothing.design, nothing.noise, first)
+
+
+def test_stribeck_s_friction_in_bristles_is_found_by_its_velocity_and_its_distance():
+    """From what turns at once; bristles of one level had more evidence, and a drift of friction took the rest."""
+    problem = pose((prepare(recording(0, lugre), ARM),), (True,), "exact").problem
+    best = found_from(StribeckFriction(4, 0.1, 0.004, 2.0, "whole"), problem)
+    assert isinstance(best.effect, StribeckBristles)
+    assert best.effect.form == "lugre"
+    assert float(best.effect.stribeck_velocity) == pytest.approx(VELOCITY, rel=0.4)
+    assert REACH * COULOMB / (COULOMB + EXCESS) < float(best.effect.breakaway_distance) < REACH
+    assert best.best > found_from(PreslidingHysteresis(4, 3e-3, "lugre only"), problem).best + 5
+
+
+def fitted(seed: int, law, effect: AbstractEffect) -> dict[str, tuple[float, float]]:
+    """Value and deviation of each parameter, the effect's shape sought from near the truth."""
+    problem = pose((prepare(recording(seed, law), ARM),), (True,), "exact").problem
+    best = found_from(effect, problem)
     state = polished(problem, with_terms(problem, [problem.term(best.effect, best.deviation)]))
     c = state.design.x[places(state)[0]]
     told = state.terms[0].effect.parameters(c, covariances(problem, state)[0])

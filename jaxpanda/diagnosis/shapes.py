@@ -108,7 +108,7 @@ def refine(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -
         top = int(values.argmax())
         other = alike[top], float(values[top]), deviations[top]
         search = float(log_mean_exp(values)) - other[1]  # what the choice of a shape of this form costs
-        if other[0].shapes and not shapes:
+        if {shape.name for shape in other[0].shapes} - {shape.name for shape in shapes}:  # one never sought
             other = climbed(problem, design, noise, other[0], first_steps(other[0]))
         if other[1] + search > likeliest:
             (effect, best, deviation), likeliest, paid = other, other[1] + search, search

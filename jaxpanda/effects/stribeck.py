@@ -13,6 +13,7 @@ from .effect import (
     AbstractEffect,
     AbstractMemoryEffect,
     Coefficient,
+    Resistance,
     Seconds,
     Shape,
 )
@@ -67,7 +68,9 @@ class StribeckFriction(AbstractDryFriction):
         """With bristles, that turn over a distance."""
         if self.form != "whole":
             return []
-        return [StribeckBristles(self.joint, self.stribeck_velocity, x, self.exponent) for x in _DISTANCES]
+        v, exponent = self.stribeck_velocity, self.exponent
+        ways = [(x, form) for form in ("bristles", "lugre") for x in _DISTANCES]
+        return [StribeckBristles(self.joint, v, x, exponent, form) for x, form in ways]
 
     @property
     def may_hold(self) -> frozenset[str]:
@@ -118,7 +121,8 @@ class StribeckBristles(AbstractMemoryEffect):
       dz = (\mathrm{sign}(\dot q_j) - z)\,|\dot q_j|\,dt / x_s$$
 
     LuGre's $\sigma_0 x_s$ is the level at the speed of the moment; here $x_s$ is the same at all speeds, which
-    leaves the law linear in its levels. A search comes to it from `StribeckFriction`.
+    leaves the law linear in its levels. Form "lugre" has what the bristles' own rate damps, too,
+    $\sigma_1 x_s \dot z = \sigma_1 (\dot q_j - z |\dot q_j|)$. A search comes to it from `StribeckFriction`.
 
     References:
         Canudas de Wit, Olsson, Åström, Lischinsky, IEEE TAC 1995, eqs. 1 to 4.
@@ -134,6 +138,7 @@ class StribeckBristles(AbstractMemoryEffect):
     stribeck_velocity: Float[Array, ""] | float
     breakaway_distance: Float[Array, ""] | float
     exponent: Float[Array, ""] | float
+    form: str = eqx.field(static=True)
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["StribeckBristles"]:
@@ -153,13 +158,16 @@ class StribeckBristles(AbstractMemoryEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return Coefficient("coulomb", "N·m", sign=1), Coefficient("static_excess", "N·m", sign=1)
+        levels = Coefficient("coulomb", "N·m", sign=1), Coefficient("static_excess", "N·m", sign=1)
+        more = (Coefficient("micro_damping", "N·m·s/rad", sign=1),) if self.form == "lugre" else ()
+        return *levels, *more
 
     @property
     def equation(self) -> str:
         return (
-            "tau = (coulomb + static_excess * exp(-(|dq| / stribeck_velocity)^exponent)) * z,"
-            " dz = (sign(dq) - z) * |dq| * dt / breakaway_distance"
+            "tau = (coulomb + static_excess * exp(-(|dq| / stribeck_velocity)^exponent)) * z"
+            + (" + micro_damping * (dq - z * |dq|)" if self.form == "lugre" else "")
+            + ", dz = (sign(dq) - z) * |dq| * dt / breakaway_distance"
         )
 
     def start(self, s: Channels) -> Float[Array, " states"]:
@@ -168,8 +176,15 @@ class StribeckBristles(AbstractMemoryEffect):
     def step(
         self, z: Float[Array, " states"], s: Channels, dt: Seconds
     ) -> tuple[Float[Array, " states"], Float[Array, " n"]]:
-        z = bristle(z, s.qd[self.joint] * dt / self.breakaway_distance)
-        return z, jnp.concatenate([z, _excess(self, s) * z])
+        qd = s.qd[self.joint]
+        z = bristle(z, qd * dt / self.breakaway_distance)
+        rate = [qd - z * jnp.abs(qd)] if self.form == "lugre" else []
+        return z, jnp.concatenate([z, _excess(self, s) * z, *rate])
+
+    def resist(self, c, arm, z, s, dt):
+        z, columns = self.step(z, s, dt)
+        damping = c[2] * (1 - z[0] * jnp.sign(s.qd[self.joint])) if self.form == "lugre" else jnp.zeros(())
+        return Resistance(self._here(columns[:2] @ c[:2], s), self._here(damping, s), z)
 
 
 def _excess(effect: StribeckFriction | StribeckBristles, s: Channels) -> Float[Array, ""]:
