@@ -283,7 +283,7 @@ class Problem:
         return here
 
     def transposed(self, noise: Noise, joint: int, here: Whitened, key: Any) -> Float[np.ndarray, "rows n"]:
-        """`Noise.transposed` of rows in a joint; of those that come in many products it is kept."""
+        """`Noise.transposed` of rows in a joint, kept while they are."""
         if key not in here.transposed:
             x = here.rows(key)
             assert x is not None
