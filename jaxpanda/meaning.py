@@ -224,22 +224,49 @@ def meaning(recording: Recording, arm: Arm) -> Meaning | None:
     return _told(best, model, min(confidence, 0.995), float(gain))
 
 
-def mounted(found: Meaning, others: Sequence[Recording], arm: Arm) -> bool:
-    """Whether a mounting that one recording tells is that of all together: an arm stands as it stands.
+def borne_out(found: Meaning, others: Sequence[Recording], arm: Arm) -> bool:
+    """Whether what one recording tells holds beside others of the same arm.
+
+    An arm stands as it stands, and recordings of one arm are mostly written alike: the reading is that of all of
+    them together, or, unless it is a mounting, that of this one alone, which is one more choice.
 
     Args:
-        found: the mounting.
+        found: what the recording tells by itself.
         others: with torque.
         arm: as for `meaning`.
     """
-    assert found.gravity is not None
-    gained, order = found.evidence, np.arange(arm.dof)
+    reading = _Reading(
+        found.kind,
+        found.evidence,
+        np.array(found.factors),
+        np.array(found.order),
+        found.whole_order,
+        None if found.gravity is None else np.array(found.gravity),
+    )
+    enough = _needs(reading) - np.log(1 - SURE)
+    if found.kind != "mounting" and found.evidence - _EACH + np.log(_PRIOR) > enough:
+        return True
+    gained = found.evidence
     for recording in others:
         if (samples := _sampled(recording)) is not None and len(samples.moving):
             with threadpool_limits(limits=1, user_api="blas"):
-                turned = _Model(arm, samples, order, np.array(found.gravity))
-                gained += turned.evidence() - _Model(arm, samples, order).evidence()
-    return bool(gained > _EACH * _CHOICES_OF_MOUNTING - np.log(1 - SURE))
+                gained += _gained(reading, _Model(arm, samples, np.arange(arm.dof)))
+    return bool(gained > enough)
+
+
+def _gained(reading: "_Reading", plain: "_Model") -> float:
+    """Evidence of a reading over the plain one, its constants as they are [nats]."""
+    arm, samples = plain.arm, plain.samples
+    if reading.kind == "gravity_removed":
+        return sum(one.score - np.log(_PRIOR) for one in _without_gravity(plain)) - plain.evidence()
+    if reading.gravity is not None or reading.whole_order:
+        return _Model(arm, samples, reading.order, reading.gravity).evidence() - plain.evidence()
+    by_joint = (
+        plain.joint_evidence(j, samples.tau[:, c], plain.torque[:, j], reading.factors[j : j + 1])[0]
+        for j, c in enumerate(reading.order)
+        if j in plain.moving
+    )
+    return float(sum(by_joint)) - plain.evidence()
 
 
 def _needs(reading: "_Reading") -> float:
@@ -354,8 +381,10 @@ class _Model:
 
     @functools.cached_property
     def size(self) -> Float[np.ndarray, " dof"]:
-        """Of each joint's torque, rms [N m]; no less than a share of the largest."""
-        rms = np.sqrt(np.mean(self.torque**2, 0))
+        """Of each joint's torque, rms [N m]; no less than a share of the largest. The arm's drives are what they
+        are, however it is mounted: by the model's own gravity."""
+        torque = self.inertial + self.weight @ np.asarray(self.arm.chain.gravity, float)
+        rms = np.sqrt(np.mean(torque**2, 0))
         return np.maximum(rms, max(_SMALL * rms.max(), 1e-6))
 
     @functools.cached_property

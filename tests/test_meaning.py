@@ -17,7 +17,7 @@ from jaxpanda.__main__ import main
 from jaxpanda.arms.source import from_mjcf
 from jaxpanda.diagnosis.finding import FAMILIES
 from jaxpanda.effects import CATALOGUE
-from jaxpanda.meaning import meaning, mounted
+from jaxpanda.meaning import borne_out, meaning
 from jaxpanda.recordings import save
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -107,9 +107,23 @@ def test_a_mounting_is_one_of_all_recordings(trial, tmp_path):
     found = meaning(turned, arm)
     assert found is not None
     seeming = dataclasses.replace(found, evidence=40.0)
-    assert mounted(seeming, [], arm)
-    assert mounted(seeming, [turned], arm)
-    assert not mounted(seeming, [trial.made("exact", *CASE)[1]], arm)
+    assert borne_out(seeming, [], arm)
+    assert borne_out(seeming, [turned], arm)
+    assert not borne_out(seeming, [trial.made("exact", *CASE)[1]], arm)
+
+
+def test_a_unit_of_one_recording_alone_takes_more_than_that_of_all(trial, tmp_path):
+    """Friction that sticks may look like another unit for a while; the same logger wrote the other recording."""
+    text, scaled = trial.made("N mm", *CASE)
+    (tmp_path / "arm.xml").write_text(text)
+    arm, _ = from_mjcf(tmp_path / "arm.xml")
+    found = meaning(scaled, arm)
+    assert found is not None
+    plain = trial.made("exact", *CASE)[1]
+    assert borne_out(found, [plain], arm)  # whoever mixes loggers is told
+    seeming = dataclasses.replace(found, evidence=22.0)
+    assert borne_out(seeming, [scaled], arm)
+    assert not borne_out(seeming, [plain], arm)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from ..arms import markup
 from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
-from ..meaning import Meaning, meaning, mounted
+from ..meaning import Meaning, borne_out, meaning
 from ..recordings import Recording
 from ..report import Section
 from . import saved
@@ -101,8 +101,9 @@ def misread(
         knowledge: how well its numbers are known; passed on.
     """
     arm = traces[0].motion.arm
-    read = [(one.name, _borne_out(meaning(one, arm), one, recordings, arm)) for one in recordings]
-    told = [(name, found) for name, found in read if found is not None]
+    read = [(one, meaning(one, arm)) for one in recordings]
+    beside = lambda one: [other for other in recordings if other is not one]
+    told = [(one.name, m) for one, m in read if m is not None and borne_out(m, beside(one), arm)]
     if not told:
         return None
     alike: dict[tuple[str, tuple[int, ...]], list[tuple[str, Meaning]]] = {}
@@ -114,7 +115,7 @@ def misread(
     floors = [t.signals.noise for t in traces if t.signals.noise is not None]
     floor = np.maximum(np.mean(floors, 0), 1e-9) if floors else np.full(arm.dof, 1e-9)
     zero = jnp.zeros(arm.dof)
-    others = sorted(name for name, found in read if found is None)
+    others = sorted({one.name for one in recordings} - {name for name, _ in told})
     notes = [f"torque is joint torque, or cannot be told, in {', '.join(others)}"] if others else []
     notes.append("corrected.xml and `predict` are your model as it is: mend the torque column first")
     return Misread(
@@ -125,15 +126,6 @@ def misread(
         notes=tuple(notes),
         knowledge=knowledge,
     )
-
-
-def _borne_out(
-    found: Meaning | None, one: Recording, recordings: Sequence[Recording], arm: Any
-) -> Meaning | None:
-    """What one recording tells, unless it is a mounting that the others contradict."""
-    if found is None or found.kind != "mounting":
-        return found
-    return found if mounted(found, [r for r in recordings if r is not one], arm) else None
 
 
 def _finding(names: Sequence[str], found: Meaning, arm: Any) -> Finding:
