@@ -13,7 +13,7 @@ from helpers import record
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose, predict
-from jaxpanda.diagnosis.credible import is_of_time
+from jaxpanda.diagnosis.credible import changes, is_of_time
 from jaxpanda.diagnosis.decide import findings, foretold
 from jaxpanda.diagnosis.diagnosis import Fit, verdict
 from jaxpanda.diagnosis.events import windows
@@ -313,7 +313,25 @@ def test_friction_that_changes_from_one_repeat_to_the_next_is_a_drift_whatever_s
     state = with_terms(problem, [problem.term(effect, np.array([1.0])) for effect in steady])
     library = [g for g in problem.library if (g.name, g.joint) == ("friction_drift", 0)]
     (drift,) = grids(problem, state.design, state.noise, library)
-    assert is_of_time(problem, state.design, state.noise, refine(problem, state.design, state.noise, drift))
+    drift = refine(problem, state.design, state.noise, drift)
+    assert changes(problem, state.design, state.noise, drift)
+    assert is_of_time(problem, state.design, state.noise, drift)
+
+
+def test_friction_that_falls_with_speed_is_no_drift_that_is_over_at_once():
+    """Beside friction of one level a negative one passed for Stribeck's, as a drift of half a second."""
+
+    def falls(t, q, qd, qdd):
+        v = qd[:, [0]]
+        return (0.6 + 0.6 * np.exp(-np.abs(v) / 0.05)) * np.tanh(v / 0.01) * np.eye(7)[0]
+
+    problem = posed(record(5, falls))
+    state = with_terms(problem, [problem.term(CoulombFriction(0, 0.01), np.array([1.0]))])
+    library = [g for g in problem.library if (g.name, g.joint) == ("friction_drift", 0)]
+    (drift,) = grids(problem, state.design, state.noise, library)
+    drift = refine(problem, state.design, state.noise, drift)
+    assert drift.evidence > 25
+    assert not changes(problem, state.design, state.noise, drift)
 
 
 @pytest.mark.slow

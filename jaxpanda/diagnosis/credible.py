@@ -22,7 +22,7 @@ AFRESH_EVENT = 0.5
 
 def is_credible(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
     """Whether a proposal is what it calls itself."""
-    tests = is_dissipative, is_clear, is_of_time
+    tests = is_dissipative, is_clear, changes, is_of_time
     return is_event(problem, proposal.effect) and all(
         test(problem, design, noise, proposal) for test in tests
     )
@@ -66,6 +66,20 @@ def is_clear(problem: Problem, design: Design, noise: Noise, proposal: Proposal)
         return True
     c, covariance = fitted(problem, design, noise, proposal)
     return bool(c[0] > least * np.sqrt(covariance[0, 0]))
+
+
+def changes(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:
+    """Whether a drift is likelier than the steady laws of its kind, whatever their signs, by what their prior
+    odds are better: one that is over at once, or hardly changes, is only called a drift."""
+    effect = proposal.effect
+    if not effect.drifts or not effect.steady or proposal.evidence < 0:
+        return True
+    parts = [problem.columns([one]) for one in (*effect.steady, effect)]
+    columns = [np.concatenate(of_one, -1) for of_one in zip(*parts, strict=True)]
+    b, G = (x[0] for x in projection(problem, design, noise, [effect], columns))
+    laws = slice(0, sum(len(law.coefficients) for law in effect.steady))
+    told = lambda at: 0.5 * float(b[at] @ np.linalg.lstsq(G[at, at], b[at])[0])
+    return told(slice(None)) - told(laws) > max(law.prior for law in effect.steady) - effect.prior
 
 
 def is_of_time(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> bool:

@@ -228,7 +228,7 @@ class Problem:
     @functools.cached_property
     def families(self) -> list[Family]:
         """Library and free forms as the scan takes them."""
-        return families([*self.library, *self.catchalls], self.dof)
+        return families([*self.library, *self.catchalls], self.arm)
 
     @functools.cached_property
     def places(self) -> Counter[str]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from ..arms.arm import Arm
 from ..effects import AbstractEffect
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
 from .host import parallel
@@ -150,7 +151,7 @@ class Family:
         return np.where(np.isnan(self.plausible), 1 / np.maximum(size, least[:, None]), self.plausible)
 
 
-def families(groups: Sequence[Candidates], dof: int) -> list[Family]:
+def families(groups: Sequence[Candidates], arm: Arm) -> list[Family]:
     """Candidates sorted into as few products as can be."""
     sorted_: dict[tuple, list[Candidates]] = defaultdict(list)
     for group in groups:
@@ -159,7 +160,7 @@ def families(groups: Sequence[Candidates], dof: int) -> list[Family]:
     out = []
     for (joint, n, scales), members in sorted_.items():
         blocks, sizes = [], []
-        for j in range(dof) if joint is None else (joint,):
+        for j in range(arm.dof) if joint is None else (joint,):
             x = np.concatenate(
                 [np.concatenate([c if joint is not None else c[:, j] for c in g.columns]) for g in members], 1
             )
@@ -167,11 +168,12 @@ def families(groups: Sequence[Candidates], dof: int) -> list[Family]:
             flat = np.ascontiguousarray(np.swapaxes(x, 1, 2)).reshape(len(x), -1)
             blocks.append(Block((joint, n, scales), j, n, flat))
         each = [k for g in members for k in [g.effects[0].coefficients] * len(g.effects)]
+        signs = [k for g in members for k in [g.effects[0].signs(arm)] * len(g.effects)]
         out.append(
             Family(
                 tuple(members),
                 tuple(blocks),
-                np.array([[float(c.sign) for c in k] for k in each]),
+                np.array(signs, float),
                 np.array([[np.nan if c.scale is None else c.scale for c in k] for k in each]),
                 np.stack(sizes),
                 scales,

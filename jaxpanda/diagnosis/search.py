@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import scipy.special
 
+from ..arms.arm import Arm
 from ..effects import AbstractJointEffect
 from .credible import fitted
 from .events import Proposal
@@ -138,7 +139,7 @@ def choices(
         for form in (p, *plainer(problem, design, noise, p)):
             term = taken(problem, design, noise, form)
             more = problem.design((*terms, term), noise)
-            if is_possible(term, more):
+            if is_possible(problem.arm, term, more):
                 found = evidence(problem, (*terms, term), more, noise)
                 out.append((found - own + term.prior, (term,)))
             problem.forget(term)
@@ -151,13 +152,16 @@ def _likeliest(proposals: Sequence[Proposal]) -> list[Proposal]:
     return [p for p in proposals if p.evidence > (_WINDOW * best if best > 0 else UNLIKELY)][:_TRIED]
 
 
-def is_possible(term: Term, design: Design) -> bool:
-    """Whether the coefficients of the last term of a design have the signs that physics allows, but for noise."""
-    first = len(design.precision) - term.width
-    at = [first + k for k, c in enumerate(term.effect.coefficients) if c.sign]
+def is_possible(arm: Arm, term: Term, design: Design) -> bool:
+    """Whether the coefficients of the last term of a design, with the numbers of the arm that they correct, have
+    the signs that physics allows, but for noise."""
+    first, effect = len(design.precision) - term.width, term.effect
+    signed = [(first + k, c.beyond) for k, c in enumerate(effect.coefficients) if c.sign]
+    at = [k for k, _ in signed]
+    held = np.array([getattr(arm, number)[effect.joints[0]] if number else 0.0 for _, number in signed])
     unit = np.eye(len(design.precision))[:, at]
     deviation = np.sqrt(np.diag(unit.T @ design.solve(unit)))
-    return bool(np.all(design.x[at] > -_NEGATIVE * deviation))
+    return bool(np.all(design.x[at] + held > -_NEGATIVE * deviation))
 
 
 def grow(problem: Problem, state: State, say: Any, free: bool = True) -> State:

@@ -65,7 +65,7 @@ def score(
 def _score(problem: Problem, design: Design, noise: Noise, effects, columns):
     """Evidence, likeliest scale, and prior deviations before the scale."""
     coefficients = effects[0].coefficients
-    signs = np.array([float(k.sign) for k in coefficients])
+    signs = np.array(effects[0].signs(problem.arm), float)
     b, G = projection(problem, design, noise, effects, columns)
     if isinstance(effects[0], AbstractJointEffect):
         unit = float(noise.std[effects[0].joints[0]])

@@ -36,6 +36,8 @@ class Coefficient:
     unit: str
     sign: int = 0
     """1: not negative; 0: either."""
+    beyond: str = ""
+    """The arm's number that it corrects: what has a sign is their sum."""
     scale: float | None = None
     """Size that is physically plausible; None: what shows in the noise decides."""
 
@@ -180,6 +182,11 @@ class AbstractEffect(eqx.Module):
     def variants(self, arm: Arm) -> Sequence["AbstractEffect"]:
         """Other forms of the same shape that a refinement should try."""
         return ()
+
+    def signs(self, arm: Arm) -> tuple[int, ...]:
+        """Which signs the coefficients may have on an arm: either, where they correct a number that it has."""
+        corrects = lambda c: bool(c.beyond) and np.asarray(getattr(arm, c.beyond))[self.joints[0]] != 0
+        return tuple(0 if corrects(c) else c.sign for c in self.coefficients)
 
     def placed(self, recording: str, later: bool | None) -> "AbstractEffect | None":
         """What of the effect acts in a recording: itself, or None.

@@ -32,8 +32,9 @@ PROPORTIONAL = 1.25
 """Exponent of the speed, or one over it, up to which friction is called proportional to it."""
 
 
-LEVEL, SLOPE = Coefficient("coulomb", "N·m"), Coefficient("damping", "N·m·s/rad")
-"""Of a law in the place of the friction that the user's model holds: by how much that friction is off."""
+LEVEL = Coefficient("coulomb", "N·m", sign=1, beyond="frictionloss")
+SLOPE = Coefficient("damping", "N·m·s/rad", sign=1, beyond="damping")
+"""Of a law that has friction of the user's model in it: by how much that is off."""
 
 
 def has_friction(arm: Arm) -> list[int]:
@@ -450,11 +451,11 @@ class FrictionDrift(AbstractDryFriction):
         level, slope = Coefficient("coulomb_change", "N·m"), Coefficient("damping_change", "N·m·s/rad")
         return {
             "level extra": (level,),
-            "level": (level, Coefficient("coulomb", "N·m")),
+            "level": (level, LEVEL),
             "slope extra": (slope,),
-            "slope": (slope, Coefficient("damping", "N·m·s/rad")),
+            "slope": (slope, SLOPE),
             "both extra": (level, slope),
-            "both": (level, slope, Coefficient("coulomb", "N·m"), Coefficient("damping", "N·m·s/rad")),
+            "both": (level, slope, LEVEL, SLOPE),
         }[self.form]
 
     @property

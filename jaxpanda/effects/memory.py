@@ -21,7 +21,7 @@ from .effect import (
     sign_over_velocity,
     smooth_sign,
 )
-from .friction import CoulombFriction
+from .friction import LEVEL, CoulombFriction
 from .motion import Channels, Joint
 
 STICKS = 1.5e-3
@@ -65,7 +65,7 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         level = Coefficient("friction_level", "N·m", sign=1)
         if self._law == "lugre":
             return level, Coefficient("micro_damping", "N·m·s/rad", sign=1)
-        return (level, Coefficient("coulomb", "N·m")) if self._extent == "whole" else (level,)
+        return (level, LEVEL) if self._extent == "whole" else (level,)
 
     @property
     def equation(self) -> str:
