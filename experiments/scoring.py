@@ -4,8 +4,9 @@
 
 Reads the truths and the answers that `concealed/score.py` leaves (which prints these figures too). A *place* is
 an effect at a joint; effects of the whole arm have one place without a joint. Truths count for recall where they
-make at least the torque noise. A claim is right where name (or an equally right one, `also` in the truth) and
-joint agree with a truth of any size, and left out where the truth calls it `allowed`. Families: INTERFACE.md.
+make at least the torque noise and are not `optional`. A claim is right where name (or an equally right one,
+`also` in the truth) and joint agree with a truth of any size, and left out where the truth calls it `allowed`.
+Families: INTERFACE.md.
 """
 
 import argparse
@@ -56,7 +57,8 @@ def truth_places(truth: dict) -> list[Place]:
     places = []
     for entry in truth["effects"]:
         name, also = plain(entry["effect"]), tuple(entry.get("also", ()))
-        ratio = np.array(entry["rms_torque"]) / noise
+        counts = not entry.get("optional", False)
+        ratio = counts * np.array(entry["rms_torque"]) / noise
         if name in EVERYWHERE:
             places.append(Place(name, 0, FAMILY_OF[name], also, float(np.max(ratio))))
         else:
@@ -193,7 +195,7 @@ def judge(truth: dict, diagnosis: dict) -> dict:
         "verdict": diagnosis["verdict"],
         "missed": [(p.effect, p.joint) for p in missed],
         "covered": inside_interval(truth, findings),
-        "null": not truth["effects"],
+        "null": all(entry.get("optional") for entry in truth["effects"]),
     }
 
 

@@ -46,6 +46,12 @@ def test_a_truth_below_the_noise_does_not_count_for_recall_but_a_claim_of_it_is_
     assert result["effect, joint"] == (0, 1, 1, 1)
 
 
+def test_what_is_optional_in_a_truth_may_be_said_or_left_out(scoring):
+    told = truth(entry("presliding_hysteresis", [1], [1.0, 0.0], optional=True))
+    assert scoring.judge(told, answer())["effect, joint"] == (0, 0, 0, 0)
+    assert scoring.judge(told, answer(finding("presliding_hysteresis", [1])))["effect, joint"] == (0, 0, 1, 1)
+
+
 def test_a_wrong_name_of_the_right_family_counts_for_the_family_only(scoring):
     told = truth(entry("coulomb_friction", [1], [1.0, 0.0]))
     result = scoring.judge(told, answer(finding("viscous_friction", [1])))
