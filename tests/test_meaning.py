@@ -61,6 +61,11 @@ def test_a_reversed_sign_is_named_with_its_joint(trial):
     assert found.options.split()[1:] == ["-" if j == joint else "+" for j in range(7)]
 
 
+def arm_of(text, folder):
+    (folder / "arm.xml").write_text(text)
+    return from_mjcf(folder / "arm.xml")[0]
+
+
 @pytest.mark.slow
 def test_all_signs_reversed_are_one_sign(trial):
     assert named(trial, "sign of all").options == "--torque-sign -"
@@ -102,8 +107,7 @@ def test_another_mounting_is_named(trial):
 def test_a_mounting_is_one_of_all_recordings(trial, tmp_path):
     """Friction of one recording may look like another gravity; the arm stands as the other recording shows it."""
     text, turned = trial.made("wall", *CASE)
-    (tmp_path / "arm.xml").write_text(text)
-    arm, _ = from_mjcf(tmp_path / "arm.xml")
+    arm = arm_of(text, tmp_path)
     found = meaning(turned, arm)
     assert found is not None
     seeming = dataclasses.replace(found, evidence=40.0)
@@ -115,8 +119,7 @@ def test_a_mounting_is_one_of_all_recordings(trial, tmp_path):
 def test_a_unit_of_one_recording_alone_takes_more_than_that_of_all(trial, tmp_path):
     """Friction that sticks may look like another unit for a while; the same logger wrote the other recording."""
     text, scaled = trial.made("N mm", *CASE)
-    (tmp_path / "arm.xml").write_text(text)
-    arm, _ = from_mjcf(tmp_path / "arm.xml")
+    arm = arm_of(text, tmp_path)
     found = meaning(scaled, arm)
     assert found is not None
     plain = trial.made("exact", *CASE)[1]
@@ -137,18 +140,14 @@ def test_what_is_missing_in_a_model_is_no_fault_of_the_column(trial, case):
 def test_friction_that_stands_in_the_file_for_nothing_is_no_unit(trial, tmp_path):
     """Joints without a load had "another unit" where the file's damping was a hundred times too large."""
     text, recording = trial.made("exact", *CASE)
-    path = tmp_path / "arm.xml"
-    path.write_text(text)
-    arm, _ = from_mjcf(path)
+    arm = arm_of(text, tmp_path)
     heavy = dataclasses.replace(arm, damping=arm.damping + 10.0, frictionloss=arm.frictionloss + 3.0)
     assert meaning(recording, heavy) is None
 
 
 def test_too_little_to_tell_is_told_nothing(trial, tmp_path):
     text, whole = trial.made("N mm", *CASE)
-    path = tmp_path / "arm.xml"
-    path.write_text(text)
-    arm, _ = from_mjcf(path)
+    arm = arm_of(text, tmp_path)
     short = Recording("short", whole.time[:400], whole.q[:400], whole.qd[:400], whole.tau[:400])
     assert meaning(short, arm) is None
     assert meaning(Recording("motion", whole.time, whole.q, whole.qd), arm) is None

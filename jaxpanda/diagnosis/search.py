@@ -155,10 +155,9 @@ def _likeliest(proposals: Sequence[Proposal]) -> list[Proposal]:
 def is_possible(arm: Arm, term: Term, design: Design) -> bool:
     """Whether the coefficients of the last term of a design, with the numbers of the arm that they correct, have
     the signs that physics allows, but for noise."""
-    first, effect = len(design.precision) - term.width, term.effect
-    signed = [(first + k, c.beyond) for k, c in enumerate(effect.coefficients) if c.sign]
-    at = [k for k, _ in signed]
-    held = np.array([getattr(arm, number)[effect.joints[0]] if number else 0.0 for _, number in signed])
+    first = len(design.precision) - term.width
+    signed = [k for k, c in enumerate(term.effect.coefficients) if c.sign]
+    at, held = [first + k for k in signed], np.array(term.effect.corrected(arm))[signed]
     unit = np.eye(len(design.precision))[:, at]
     deviation = np.sqrt(np.diag(unit.T @ design.solve(unit)))
     return bool(np.all(design.x[at] + held > -_NEGATIVE * deviation))

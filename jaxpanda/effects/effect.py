@@ -183,10 +183,15 @@ class AbstractEffect(eqx.Module):
         """Other forms of the same shape that a refinement should try."""
         return ()
 
+    def corrected(self, arm: Arm) -> tuple[float, ...]:
+        """Of each coefficient, the arm's number that it corrects; 0 for none."""
+        number = lambda name: float(np.asarray(getattr(arm, name))[self.joints[0]])
+        return tuple(number(c.beyond) if c.beyond else 0.0 for c in self.coefficients)
+
     def signs(self, arm: Arm) -> tuple[int, ...]:
         """Which signs the coefficients may have on an arm: either, where they correct a number that it has."""
-        corrects = lambda c: bool(c.beyond) and np.asarray(getattr(arm, c.beyond))[self.joints[0]] != 0
-        return tuple(0 if corrects(c) else c.sign for c in self.coefficients)
+        numbers = self.corrected(arm)
+        return tuple(0 if n else c.sign for c, n in zip(self.coefficients, numbers, strict=True))
 
     def placed(self, recording: str, later: bool | None) -> "AbstractEffect | None":
         """What of the effect acts in a recording: itself, or None.
