@@ -113,12 +113,13 @@ class Convention:
         dof, notes = recording.dof, []
         order, alone = self.order(dof)
         factors = self.factors(dof)
-        q, qd, tau = recording.q, recording.qd, recording.tau
+        q, qd, tau, motor = recording.q, recording.qd, recording.tau, recording.tau_motor
         place = [order.index(j) for j in range(dof)]
         if self.joint_order:
             tau = None if tau is None else tau[:, place]
             if not alone:
                 q, qd = q[:, place], None if qd is None else qd[:, place]
+                motor = None if motor is None else motor[:, place]
             what = "tau" if alone else "all columns"
             notes.append(f"{what} read as those of joints {' '.join(str(j + 1) for j in order)}")
         if tau is not None and (self.torque_sign or self.torque_unit):
@@ -129,7 +130,7 @@ class Convention:
             tau = tau + weight_torque(arm, q)
             notes.append("the model's gravity torque was added to tau, so that it tells nothing of weights")
         notes = (*recording.notes, *(f"as asked, {note}" for note in notes))
-        return dataclasses.replace(recording, q=q, qd=qd, tau=tau, notes=notes)
+        return dataclasses.replace(recording, q=q, qd=qd, tau=tau, tau_motor=motor, notes=notes)
 
 
 PLAIN = Convention()

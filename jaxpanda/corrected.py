@@ -257,6 +257,13 @@ def read(
     document = read_json(path)
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise InputError(f"{path}: is no corrected model; a folder that `diagnose` wrote is needed")
+    return _of(document, path, effects)
+
+
+def _of(
+    document: Mapping[str, Any], path: Path, effects: Sequence[type[AbstractEffect]]
+) -> tuple[Corrected, Float[np.ndarray, " dof"]]:
+    """The arm and the noise that a document holds, checked."""
     try:
         found, noise = Corrected.from_json(document, effects), np.asarray(document["torque_noise"], float)
         _check_numbers(found, noise)
@@ -267,6 +274,21 @@ def read(
             f"{path}: is not as `diagnose` writes it ({type(error).__name__}: {reason(error)}); diagnose again"
         ) from None
     return found, noise
+
+
+def read_sides(
+    folder: str | Path, effects: Sequence[type[AbstractEffect]] = ()
+) -> tuple[tuple[Corrected, Float[np.ndarray, " dof"]], ...]:
+    """What is behind the drives and what is in them, each with the noise of its torque [N m], where `diagnose`
+    saw the torque of both sides; else nothing. Called like `Corrected.load`, which gives the whole arm.
+
+    Raises:
+        InputError: as `read`.
+    """
+    path = Path(folder) / FILE
+    read(folder, effects)
+    sides = read_json(path).get("sides")
+    return () if not sides else tuple(_of(sides[side], path, effects) for side in ("link", "drive"))
 
 
 def _turns(document: Mapping[str, Any]) -> tuple[Turn | None, ...]:

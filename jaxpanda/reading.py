@@ -11,7 +11,7 @@ import tyro
 
 from .errors import InputError
 
-CHANNELS = ("time", "q", "dq", "tau")
+CHANNELS = ("time", "q", "dq", "tau", "tau_motor")
 """What a log's columns can be, as the canonical CSV calls it."""
 
 
@@ -50,7 +50,7 @@ class Reading:
         said: dict[str, str] = {}
         for given in self.columns:
             channel, equals, where = given.partition("=")
-            stem, _, joint = channel.partition("_")
+            stem, _, joint = channel.rpartition("_")
             if not equals or (channel not in CHANNELS and not (stem in CHANNELS[1:] and joint.isdecimal())):
                 raise InputError(
                     f"--columns {given}: CHANNEL=COLUMNS is needed, such as q=pos_{{j}}, where CHANNEL is one of"

@@ -140,8 +140,8 @@ def replay(
 
     Args:
         diagnosis: the folder that `diagnose` wrote, or the corrected arm.
-        recording: with torque. What the diagnosis saw happen in a recording of this name, a contact or a change
-            of payload, happens in the replay.
+        recording: with torque; that of the motors moves the arm where both were measured. What the diagnosis saw
+            happen in a recording of this name, a contact or a change of payload, happens in the replay.
         model: MJCF of the arm, the user's or the corrected one; where a folder is given, its `corrected.xml`.
         engine: "mujoco" is C MuJoCo, "mjx" is MJX.
         seconds: length, at most.
@@ -157,6 +157,8 @@ def replay(
     recording = recording if isinstance(recording, Recording) else load_recording(recording)
     recording.require_dof(corrected.arm.dof)
     recording.require_tau()
+    if recording.tau_motor is not None:
+        recording = recording.of_motor_side()
     plant = corrected.plant(_called(corrected, recording))
     bare = engine_model(source, plant.arm)
     task = make_task(

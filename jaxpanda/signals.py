@@ -123,9 +123,9 @@ def prepare(
     derivative_cutoff, notes = _cutoffs(recording.name, cutoff, derivative_cutoff, full_rate, notes)
     bridged = np.max(np.diff(recording.time)) > LONGEST_GAP
     smooth = scipy.interpolate.PchipInterpolator if bridged else scipy.interpolate.CubicSpline
-    q = _resample(recording.time, recording.q, time, smooth)
+    q = resampled(recording.time, recording.q, time, smooth)
     q, qd, qdd = derivatives(q, derivative_cutoff, full_rate)
-    tau = None if recording.tau is None else _resample(recording.time, recording.tau, time)
+    tau = None if recording.tau is None else resampled(recording.time, recording.tau, time)
     trim = max(0.6, 1 / cutoff) if trim is None else trim
     keep = _kept(recording, time, step, trim, min(100.0 if rate is None else rate, full_rate))
     return Signals(
@@ -337,7 +337,7 @@ def _grid(recording: Recording) -> tuple[Float[np.ndarray, " time"], float, dict
     return time, step, repairs, notes
 
 
-def _resample(
+def resampled(
     time: Float[np.ndarray, " row"],
     x: Float[np.ndarray, "row dof"],
     grid: Float[np.ndarray, " time"],

@@ -268,6 +268,8 @@ def prediction(made: Any) -> Sequence[Section]:
             else f"Error against the recorded torque, its noise included: {number(share)} %."
         )
         columns["error, rms"] = made.rmse
+    if made.rmse_motor is not None:
+        columns["error of tau_motor, rms"] = made.rmse_motor
     caption = f"Predicted torque [{made.unit}]"
     return [Section("Prediction", sentences, [by_joint(caption, made.joints, columns)])]
 
@@ -455,6 +457,7 @@ _SUMMARIES: Mapping[str, Callable[[Any], Sequence[Section]]] = {
     "Diagnosis": diagnosis,
     "AtRest": diagnosis,
     "Misread": diagnosis,
+    "TwoSided": diagnosis,
     "Prediction": prediction,
     "PayloadEstimate": payload,
     "Conversion": conversion,

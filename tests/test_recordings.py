@@ -47,15 +47,16 @@ def same(a: Recording, b: Recording) -> bool:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".npz", ".parquet"])
-@pytest.mark.parametrize("channels", ["all", "no dq", "motion"])
+@pytest.mark.parametrize("channels", ["all", "both torques", "no dq", "motion"])
 def test_a_saved_recording_reads_back_to_the_same_numbers(tmp_path, suffix, channels):
     made = recording()
     made = Recording(
         "made",
         made.time,
         made.q,
-        made.qd if channels == "all" else None,
+        None if channels in ("no dq", "motion") else made.qd,
         None if channels == "motion" else made.tau,
+        tau_motor=1.1 * made.tau if channels == "both torques" else None,
     )
     save(made, tmp_path / f"rec{suffix}")
     back = load(tmp_path / f"rec{suffix}")

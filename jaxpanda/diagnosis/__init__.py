@@ -6,5 +6,7 @@ from .commands import predict_files as predict_files
 from .diagnosis import Diagnosis as Diagnosis
 from .diagnosis import Finding as Finding
 from .diagnosis import Fit as Fit
-from .diagnosis import diagnose as diagnose
-from .diagnosis import predict as predict
+from .entry import diagnose as diagnose
+from .entry import predict as predict
+from .entry import predict_sides as predict_sides
+from .two_sided import TwoSided as TwoSided

@@ -107,9 +107,7 @@ def _beginning(recording: Recording) -> Recording:
     count = int(np.searchsorted(recording.time, recording.time[0] + LONG, "right"))
     if count == recording.samples:
         return recording
-    channels = {name: getattr(recording, name) for name in ("time", "q", "qd", "tau", "stamps")}
-    cut = {name: x[:count] for name, x in channels.items() if x is not None}
-    return dataclasses.replace(recording, **cut, row=None)
+    return recording.at(slice(count))
 
 
 def _squares(

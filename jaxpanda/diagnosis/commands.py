@@ -20,8 +20,9 @@ from ..reading import Reading
 from ..recordings import Recording, distinct, load, load_many
 from ..rollout import compare
 from ..session import telling
-from . import meaning, page, resting
-from .diagnosis import Diagnosis, diagnose, predict
+from . import meaning, page, resting, two_sided
+from .diagnosis import Diagnosis
+from .entry import diagnose, predict_sides
 from .host import on_host
 from .knowledge import Knowledge
 
@@ -41,6 +42,8 @@ class Prediction:
     """Of each joint against the torque that the motion's file has, noise included; None where it has none."""
     relative_error_percent: float | None = None
     """Norm of that error over the norm of the recorded torque."""
+    rmse_motor: tuple[float, ...] | None = None
+    """The same of the motors' torque, where the diagnosis was of both and the file has it."""
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -51,6 +54,7 @@ class Prediction:
             "rms": list(self.rms),
             "rmse": None if self.rmse is None else list(self.rmse),
             "relative_error_percent": self.relative_error_percent,
+            "rmse_motor": None if self.rmse_motor is None else list(self.rmse_motor),
         }
 
 
@@ -64,7 +68,7 @@ def diagnose_files(
     *,
     reading: Reading | None = None,
     convention: Convention = PLAIN,
-) -> Diagnosis | resting.AtRest | meaning.Misread:
+) -> Diagnosis | two_sided.TwoSided | resting.AtRest | meaning.Misread:
     """`jaxpanda diagnose`."""
     if not recordings:
         raise InputError("--recording: none given; name at least one file or folder")
@@ -99,7 +103,8 @@ def diagnose_files(
             say("simulating both arms along a recording")
             found = _replayed(found, suspect)
             say("writing the report")
-            sections = page.sections(found)
+            whole = isinstance(found, two_sided.TwoSided)
+            sections = page.sides(found) if whole else page.sections(found)
         report.to_html("jaxpanda: diagnosis", sections, folder / "report.html")
         found.save(folder)
     return found
@@ -128,12 +133,17 @@ def _placed(term: re.Match[str]) -> str:
     return f"{term[1].replace('_', ' ')} at joint{'s' * (len(joints) > 1)} {', '.join(joints)}"
 
 
-def _replayed(found: Diagnosis, recordings: Sequence[Recording]) -> Diagnosis:
-    """With how closely both simulations follow a recording, the one in which something happened if any."""
+def _replayed(
+    found: Diagnosis | two_sided.TwoSided, recordings: Sequence[Recording]
+) -> Diagnosis | two_sided.TwoSided:
+    """With how closely both simulations follow a recording, the one in which something happened if any, under the
+    torque of the motors where that was measured."""
     if not found.findings:
         return found
     once = [f.recordings[0] for f in found.findings if f.intervals is not None]
     recording = next((r for r in recordings if r.name in once), recordings[0])
+    if isinstance(found, two_sided.TwoSided):
+        recording = recording.of_motor_side()
     try:
         return dataclasses.replace(found, replays=(compare(found.corrected, found.source, recording),))
     except InputError as error:
@@ -147,7 +157,7 @@ def _source(role: str, path: Path, names: Mapping[Path | None, str]) -> dict[str
     return {"role": role, "name": name, "sha256": inputs.digest(*parts)}
 
 
-_OWN = re.compile(rb"time(,tau_\d+)+\n")  # no recording has torque and no position
+_OWN = re.compile(rb"time(,tau_\d+)+(,tau_motor_\d+)*\n")  # no recording has torque and no position
 
 
 def predict_files(
@@ -164,12 +174,16 @@ def predict_files(
         raise InputError(f"--gravity: {XML} has its gravity already; give it to the command diagnose")
     (motion,) = convention.applied([load(recording, reading=reading)], diagnosis / XML)
     arm = read(diagnosis)[0].arm
-    tau = predict(diagnosis, motion)
-    head = ",".join(["time", *(f"tau_{j + 1}" for j in range(tau.shape[1]))])
-    table = np.column_stack([motion.time if motion.stamps is None else motion.stamps, tau]).tolist()
+    tau, motors = predict_sides(diagnosis, motion)
+    columns = {"tau": tau} | ({} if motors is None else {"tau_motor": motors})
+    head = ",".join(["time", *(f"{name}_{j + 1}" for name, x in columns.items() for j in range(x.shape[1]))])
+    stamps = motion.time if motion.stamps is None else motion.stamps
+    table = np.column_stack([stamps, *columns.values()]).tolist()
     with output_file(out, lambda content: _OWN.match(content) is not None) as file:
         write_text(file, "\n".join([head, *(",".join(map(repr, row)) for row in table)]) + "\n")
     made = Prediction(out, len(tau), arm.joint_names, arm.unit("N·m"), _rms(tau))
+    if motors is not None and motion.tau_motor is not None:
+        made = dataclasses.replace(made, rmse_motor=_rms(motors - motion.tau_motor))
     if motion.tau is None:
         return made
     error, size = tau - motion.tau, float(np.linalg.norm(motion.tau))

@@ -265,7 +265,7 @@ def _beyond_the_library(problem: Problem) -> list[list[AbstractEffect]]:
         out.append([ExternalContact(link, float(s), float(s) + _PUSH, trace.name, "base") for s in starts])
     last_link, half = problem.dof - 1, 0.5 * (first + last)
     out.append([PayloadChange(last_link, half, 1e9, trace.name, "gained")])
-    return out
+    return [effects for effects in out if type(effects[0]) in problem.catalogue]
 
 
 def _least(

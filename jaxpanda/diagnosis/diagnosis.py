@@ -1,4 +1,4 @@
-"""`diagnose`: which physics a simulation is missing, by recordings; `predict`: torque, by what it found."""
+"""Which physics recordings say that an arm's model is missing, and how well the corrected model fits them."""
 
 import dataclasses
 import functools
@@ -14,38 +14,32 @@ from .. import files
 from .. import signals as signals_
 from ..arms import markup
 from ..arms.arm import Arm
-from ..arms.export import missing_assets, panda_mjcf
-from ..arms.mjcf import MjcfSource, with_gravity
-from ..arms.model_file import Model
-from ..arms.source import from_document, from_mjcf
-from ..corrected import KIND, Corrected, read
-from ..effects import AbstractEffect, catalogue_with
+from ..arms.export import missing_assets
+from ..arms.mjcf import MjcfSource
+from ..corrected import KIND, Corrected
+from ..effects import AbstractEffect
 from ..effects.drive import Armature
-from ..errors import InputError, require_x64
 from ..posterior import FILE as POSTERIOR_FILE
-from ..recordings import Recording, distinct, load
-from ..session import Say, silent
+from ..recordings import Recording
+from ..session import Say
 from . import knowledge as knowledge_
 from . import saved
-from .as_recorded import as_recorded, misleading, predicted
+from .as_recorded import as_recorded, misleading
 from .calibration import SMALL, are_told, calibrated, is_large
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import Finding, Fit
-from .host import on_host
 from .localise import Localisation, localise, unbiased
-from .meaning import Misread, misread
 from .next_motion import NextMotion, next_motion
 from .posterior import posterior_of
 from .premises import Premises, settled
 from .problem import FOLDS, Problem
-from .resting import AtRest, judge, rests
 from .search import transferable
 from .state import State, with_terms
-from .traces import Trace, prepare, work_rate
+from .traces import Trace
 from .uncertainty import polished
 from .unnamed import BEYOND
-from .written import buildable, corrected_document, worsened
+from .written import buildable
 
 NEXT_MOTION = "next_motion.csv"
 UNSURE = 0.6
@@ -169,62 +163,29 @@ class Diagnosis:
         return missing_assets(self.written, Path(folder))
 
 
-@on_host
-def diagnose(
-    model: Model | None,
-    recordings: Sequence[str | Path | Recording],
-    *,
-    reference: Sequence[str | Path | Recording] = (),
-    knowledge: knowledge_.Knowledge = "identified",
-    gravity: Sequence[float] | None = None,
-    effects: Sequence[type[AbstractEffect]] = (),
-    progress: Say = silent,
-) -> Diagnosis | AtRest | Misread:
-    """Say which physics a simulation is missing; of an arm that holds still, what friction at rest leaves open;
-    of torque that is not what inverse dynamics gives, what it is.
+def sought(
+    arm: Arm,
+    source: MjcfSource,
+    recordings: Sequence[Recording],
+    traces: Sequence[Trace],
+    active: Sequence[bool],
+    knowledge: knowledge_.Knowledge,
+    catalogue: tuple[type[AbstractEffect], ...],
+    progress: Say,
+) -> tuple[Diagnosis, Corrected]:
+    """Search the recordings for physics that the arm lacks; what was found, and what of it the user's file is to
+    hold. `Diagnosis.written` is that file as it was.
 
     Args:
-        model: the simulation (MJCF) as the user has it; None for the project's own Panda.
-        recordings: of the arm, with torque.
-        reference: recordings of the same arm from when nothing was wrong; what they show is not reported.
-        knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` explains the words.
-        gravity: in place of the model's, in the frame of its world [m/s²].
-        effects: classes of your own that are tried beside the catalogue's; `Corrected.load`, `predict` and
-            `replay` take them too. They are not tried on an arm that holds still.
-        progress: called with what is being done, and with each line of `log` as it is written.
-
-    Raises:
-        InputError: a file that cannot be read, a recording that does not fit the model, or one given twice; an
-            effect that is none, or whose name is taken.
+        arm: whose torque is compared.
+        source: the simulation.
+        recordings: those in question.
+        traces: of all recordings.
+        active: of each trace, whether it is in question.
+        knowledge: how well the arm's numbers are known.
+        catalogue: effects that are tried.
+        progress: called with what is being done.
     """
-    require_x64("a diagnosis")
-    catalogue = catalogue_with(effects)
-    knowledge_.check(knowledge)
-    if model is None:
-        own = markup.parse(panda_mjcf(), "mujoco", Path("panda.xml"))
-        arm, source = from_document(with_gravity(own, gravity))
-    else:
-        arm, source = from_mjcf(model, gravity)
-    if not recordings:
-        raise InputError("no recording: a diagnosis needs at least one")
-    loaded = [one if isinstance(one, Recording) else load(one) for one in (*recordings, *reference)]
-    traces, active = [], [i < len(recordings) for i in range(len(loaded))]
-    coarse = work_rate(loaded)
-    for recording in distinct(loaded):
-        recording.require_dof(arm.dof)
-        recording.require_tau()
-        traces.append(prepare(recording, arm, coarse=coarse))
-        progress(_read(traces[-1]))
-    suspect = [trace for trace, on in zip(traces, active, strict=True) if on]
-    if all(rests(trace) for trace in suspect):
-        healthy = [trace for trace, on in zip(traces, active, strict=True) if not on]
-        return judge(suspect, healthy, source, knowledge)
-    for recording in loaded:
-        _require_live_torque(recording)
-    in_question = [one for one, on in zip(distinct(loaded), active, strict=True) if on]
-    wrongly_read = misread(in_question, suspect, source, knowledge)
-    if wrongly_read is not None:
-        return wrongly_read
     progress("looking for effects that make the recordings likelier; that takes most of the time")
     log = _Log(progress)
     premises, searched = settled(tuple(traces), tuple(active), knowledge, log, catalogue=catalogue)
@@ -237,7 +198,7 @@ def diagnose(
     kept, quiet = transferable(problem, laws), problem.noise(()).std
     correct = lambda by: _corrected(arm, premises, by, refitted=bool(by.terms or wrong))
     corrected = correct(kept)
-    if worse := misleading(in_question, corrected, quiet, len(kept.terms)):
+    if worse := misleading(recordings, corrected, quiet, len(kept.terms)):
         kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
         corrected = correct(kept)
     lost = [all(t is not k for k in kept.terms) for t in laws.terms]
@@ -261,18 +222,14 @@ def diagnose(
             "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
             f" or with all of the motion: {', '.join(sorted(dropped))}"
         )
-    corrected = as_recorded(in_question, buildable(source, corrected, problem), quiet)
-    # numbers that only moved within what they were uncertain by stay as the user wrote them
-    document, warnings = corrected_document(source, corrected if wrong else corrected.as_written, problem)
-    if document is not source.document:
-        warnings = (*warnings, *worsened(arm, from_document(document, source.dropped)[0], in_question, quiet))
+    corrected = as_recorded(recordings, buildable(source, corrected, problem), quiet)
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
-    return Diagnosis(
+    made = Diagnosis(
         verdict=answer,
         findings=tuple(told),
         fit=fitted,
         corrected=corrected,
-        written=document,
+        written=source.document,
         notes=(
             *notes,
             *repairs,
@@ -281,7 +238,6 @@ def diagnose(
             *_turned(problem, state),
             *_as_recorded(corrected),
             *(n for t in traces for n in t.signals.notes),
-            *warnings,
         ),
         log=tuple(log),
         problem=problem,
@@ -292,6 +248,8 @@ def diagnose(
         kept=kept,
         scale=premises.scale,
     )
+    # numbers that only moved within what they were uncertain by stay as the user wrote them
+    return made, corrected if wrong else corrected.as_written
 
 
 def _too_unsure(findings: Sequence[Finding]) -> str:
@@ -313,12 +271,6 @@ class _Log(list[str]):
     def append(self, line: str) -> None:
         super().append(line)
         self.progress(line)
-
-
-def _read(trace: Trace) -> str:
-    """What was read, in a line."""
-    time, dof = trace.motion.time, trace.motion.q.shape[1]
-    return f"{trace.name}: {time[-1] - time[0]:.1f} s, {dof} joints"
 
 
 def _still(trace: Trace) -> list[str]:
@@ -382,18 +334,6 @@ def _unheard(problem: Problem) -> list[str]:
         f"too few samples of joint{'s' * (len(joints) > 1)} {', '.join(joints)} can be used to tell physics from"
         " noise, so that torque was not judged there"
     ]
-
-
-def _require_live_torque(recording: Recording) -> None:
-    """Refuse torque that is absent, or a channel that is stuck: without noise nothing tells what is beyond it."""
-    recording.require_tau()
-    assert recording.tau is not None
-    stuck = np.flatnonzero(np.ptp(recording.tau, axis=0) == 0)
-    if len(stuck):
-        raise InputError(
-            f"{recording.name}: column tau_{stuck[0] + 1} never changes; a diagnosis needs torque as the sensor"
-            " gave it, with its noise"
-        )
 
 
 def _errors(problem: Problem, state: State) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -485,25 +425,3 @@ def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) ->
     return Corrected(
         arm, jnp.asarray(change), jnp.asarray(damping), jnp.asarray(level), tuple(effects), tuple(values)
     )
-
-
-def predict(
-    folder: str | Path, motion: str | Path | Recording, *, effects: Sequence[type[AbstractEffect]] = ()
-) -> Float[np.ndarray, "rows dof"]:
-    """Torque [N m] that the sensors would measure, for each row of a motion, from what `diagnose` saved.
-
-    Args:
-        folder: that `diagnose` wrote.
-        motion: of the arm.
-        effects: classes of your own that `diagnose` was given.
-
-    Raises:
-        InputError: no saved diagnosis in the folder, a motion of another arm, or an effect of an unknown class.
-    """
-    require_x64("a prediction")
-    corrected, noise = read(folder, effects)
-    recording = motion if isinstance(motion, Recording) else load(motion)
-    recording.require_dof(corrected.arm.dof)
-    trace, tau = predicted(recording, corrected, noise)
-    grid = trace.motion.time
-    return np.stack([np.interp(recording.time, grid, column) for column in tau.T], 1)

@@ -129,11 +129,14 @@ def _likeliest(
 
 
 def windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposal]:
-    """For each link and recording the likeliest window of a contact, and the likeliest change of payload.
+    """For each link and recording the likeliest window of a contact, and the likeliest change of payload; none
+    where the catalogue has neither, as of drives alone.
 
     Beside slow errors a window tells by its edges, and one whose edges are a little off tells next to nothing:
     there those of a scan that knows of no slow errors are given too.
     """
+    if not {ExternalContact, PayloadChange} <= set(problem.catalogue):
+        return
     yield from _windows(problem, design, noise)
     if any(noise.has_slow(j) for j in range(problem.dof)):
         plain = dataclasses.replace(noise, slow=None)

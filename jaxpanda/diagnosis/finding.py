@@ -40,6 +40,8 @@ class Finding:
     foretold: float | None = None
     """By how much likelier it makes torque that its coefficients were not fitted to [nats]; None where it has
     none."""
+    side: str = ""
+    """Of the drives: "link", behind them, or "drive", in them; "" where torque was measured on one side."""
     own_family: str = "unknown"
     """Of an effect that `FAMILIES` does not have."""
 
@@ -53,6 +55,7 @@ class Finding:
             "effect": self.effect,
             "family": self.family,
             "kind": self.kind,
+            "side": self.side or None,
             "joints": [j + 1 for j in self.joints],
             "recordings": list(self.recordings),
             "intervals": None if self.intervals is None else [list(pair) for pair in self.intervals],

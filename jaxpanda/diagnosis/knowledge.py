@@ -42,8 +42,8 @@ def check(knowledge: str) -> None:
 def inertial_spread(
     arm: Arm, knowledge: Knowledge, noise: Float[np.ndarray, " dof"]
 ) -> Float[np.ndarray, "standard n"]:
-    """Square root L of the covariance $LL^\\top$ of the standard parameters."""
-    if knowledge == "exact":
+    """Square root L of the covariance $LL^\\top$ of the standard parameters; of an arm without links, none."""
+    if knowledge == "exact" or not np.any(arm.standard):
         return np.zeros((10 * arm.dof, 0))
     if knowledge == "rough":
         return _rough(arm)

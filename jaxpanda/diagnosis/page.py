@@ -1,5 +1,6 @@
 """The page of a diagnosis: what it found, the pictures that made it say so, and what it could not see."""
 
+import dataclasses
 import difflib
 import platform
 from collections.abc import Collection, Mapping, Sequence
@@ -17,6 +18,7 @@ from .decide import coefficients
 from .diagnosis import NEXT_MOTION, Diagnosis
 from .finding import Finding
 from .localise import REGIMES, Localisation, lag_profile, order_spectrum, since_reversal
+from .two_sided import TwoSided
 from .unnamed import sines
 
 _POINTS = 900
@@ -47,6 +49,36 @@ def sections(found: Diagnosis) -> list[Section]:
     out += [_where(found, names), _heat_map(found, names), _exclusion(found, names)]
     out += [_file(found), _method(found, names)]
     return out
+
+
+def sides(found: TwoSided) -> list[Section]:
+    """The page of torque before and behind the drives: both together, then each, then the whole arm's file."""
+    document, names = found.to_json(), found.corrected.arm.joint_names
+    force = found.corrected.arm.unit("N·m")
+    errors = [
+        summaries.by_joint(
+            f"Error of {column} in the band of the diagnosis, rms [{force}]",
+            names,
+            summaries.fit_columns(document[fit]),
+        )
+        for column, fit in (("tau", "fit"), ("tau_motor", "fit_motor"))
+    ]
+    out = [Section("Verdict", found.lines(), errors, tone=_TONES[found.verdict])]
+    for what, side in (("Behind the drives", found.link), ("In the drives", found.drive)):
+        here = [_finding(side, i, one, names) for i, one in enumerate(side.findings)]
+        here += [_held_out(side), _where(side, names), _heat_map(side, names), _exclusion(side, names)]
+        here.append(_method(side, names))
+        out += [dataclasses.replace(section, heading=f"{what}: {section.heading}") for section in here]
+    whole = dataclasses.replace(
+        found.drive,
+        corrected=found.corrected,
+        written=found.written,
+        notes=found.warnings,
+        replays=found.replays,
+    )
+    if found.replays:
+        out.append(_replays(whole, names))
+    return [*out, _file(whole)]
 
 
 def _verdict(found: Diagnosis, document: Mapping[str, Any], names: Sequence[str]) -> Section:

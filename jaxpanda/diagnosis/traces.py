@@ -195,7 +195,7 @@ def prepare(
 
     Args:
         recording: with torque, or a motion.
-        arm: whose nominal torque is to be compared.
+        arm: whose nominal torque is to be compared; without links, where the recording says what they take.
         whole: one grid for all, ends and gaps included, as prediction needs.
         noise: of the torque [N m], where the recording does not tell.
         turns: how each joint's Coulomb friction turns; None, or no entries: as MuJoCo's constraint does.
@@ -232,12 +232,15 @@ def prepare(
             sign[:, joint] = turn.share(q[fine, joint], qd[fine, joint])
     doubtful = _unsure_sign(position, qd, width + _TURN * np.abs(qdd), cutoff_q, rate)[fine][kept]
     held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
-    held, tau = held_fine[kept], None if rough.tau is None else rough.tau[keep]
+    held = held_fine[kept]
     if stride > thin:
         held = signals_.zero_phase(held_fine, cutoff, 1 / dt)[kept]
-    if stride > 1 and rough.tau is not None:
-        tau = signals_.zero_phase(rough.tau, cutoff, rate)[keep]
-    motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], held)
+    coarsely = lambda x: (signals_.zero_phase(x, cutoff, rate) if stride > 1 else x)[keep]
+    tau = None if rough.tau is None else coarsely(rough.tau)
+    passed = recording.transmitted
+    if passed is not None:
+        passed = coarsely(signals_.resampled(recording.time, passed, time))
+    motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], held, passed)
 
     def finely(x: np.ndarray) -> np.ndarray:
         if len(kept) == len(fine):
@@ -437,6 +440,8 @@ def _clearest_cutoff(
     count by $(M_{jj}/\sigma_{\tau,j})^2$. The noise is white, or that of a smooth motion written in steps.
     """
     M = np.diag(masses(arm, q.mean(0)[None])[0])
+    if not np.any(M):  # noise of q does no harm
+        return min(POSITION_CUTOFF, 0.25 * rate)
 
     # whole half windows, and mirrored beyond the ends: every instant counts, the last ones too
     count = len(q) - 2

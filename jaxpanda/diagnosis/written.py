@@ -13,6 +13,7 @@ from ..arms import markup
 from ..arms.arm import Arm
 from ..arms.export import ExportResult, edit_mjcf, write_parameters
 from ..arms.mjcf import MjcfSource
+from ..arms.source import from_document
 from ..corrected import Corrected
 from ..effects import AbstractEffect
 from ..effects.native import nearest
@@ -38,6 +39,18 @@ def buildable(source: MjcfSource, corrected: Corrected, problem: Problem) -> Cor
     if np.any(off > UNSEEN * problem.noise(()).std):
         return corrected
     return eqx.tree_at(lambda c: c.change, corrected, corrected.change + (built - standard))
+
+
+def file_with(
+    source: MjcfSource, corrected: Corrected, problem: Problem, recordings: Sequence[Recording]
+) -> tuple[markup.Document, tuple[str, ...]]:
+    """The user's file with what MuJoCo holds of the corrected arm; what it does not hold, and where it is further
+    from the recordings than it was."""
+    document, warnings = corrected_document(source, corrected, problem)
+    if document is not source.document:
+        after, _ = from_document(document, source.dropped)
+        warnings = (*warnings, *worsened(corrected.arm, after, recordings, problem.noise(()).std))
+    return document, warnings
 
 
 def corrected_document(

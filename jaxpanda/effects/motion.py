@@ -36,7 +36,8 @@ class Channels(eqx.Module):
 class Motion:
     """A motion on a uniform grid; what the nominal arm says about it is computed once, when asked for.
 
-    `friction` is the torque of the friction that the nominal model holds [N m].
+    `friction` is the torque of the friction that the nominal model holds [N m]; `transmitted` what the drives
+    pass on to the links, where that was measured and the arm's links are left to it.
     """
 
     def __init__(
@@ -47,8 +48,10 @@ class Motion:
         qd: Float[np.ndarray, "time dof"],
         qdd: Float[np.ndarray, "time dof"],
         friction: Float[np.ndarray, "time dof"],
+        transmitted: Float[np.ndarray, "time dof"] | None = None,
     ):
         self.arm, self.time, self.q, self.qd, self.qdd, self.friction = arm, time, q, qd, qdd, friction
+        self.transmitted = transmitted
         self.dt = float(time[1] - time[0])
 
     @property
@@ -63,7 +66,9 @@ class Motion:
     def load(self) -> Float[np.ndarray, "time dof"]:
         """Torque of the nominal rigid arm with armature and springs [N m]: all of the model that is smooth."""
         arm = self.arm
-        rigid = self._over(_rigid_torque, self.q, self.qd, self.qdd)
+        rigid = self.transmitted
+        if rigid is None:
+            rigid = self._over(_rigid_torque, self.q, self.qd, self.qdd)
         armature, stiffness, springref = (np.asarray(x) for x in (arm.armature, arm.stiffness, arm.springref))
         return rigid + armature * self.qdd + stiffness * (self.q - springref)
 

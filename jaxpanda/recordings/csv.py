@@ -88,7 +88,7 @@ def _is_number(cell: str) -> bool:
 
 def csv_bytes(recording: Recording, name: str) -> bytes:
     """The canonical CSV, packed for a `.gz`; every number in the shortest form that reads back the same."""
-    names = canonical_names(recording.dof, recording.qd is not None, recording.tau is not None)
+    names = canonical_names(recording)
     table = np.column_stack([recording.time, *recording.channels()])
     text = "\n".join([",".join(names), *(",".join(map(repr, row)) for row in table.tolist())]) + "\n"
     content = text.encode()

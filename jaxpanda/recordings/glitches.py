@@ -9,7 +9,7 @@ from .recording import Recording
 
 LEFT_OUT = "rows left out, as a reading in them stands alone"
 """What the account of repairs says."""
-_LEAST = {"q": 0.01, "tau": 1.0}
+_LEAST = {"q": 0.01, "tau": 1.0, "tau_motor": 1.0}
 """How far from those beside it [rad, N m]; what is nearer does no harm."""
 _LONGEST = 3
 """Rows that such a reading lasts, at most."""
@@ -30,7 +30,7 @@ def without_glitches(recording: Recording) -> Recording:
     One row of a torque that is 1e6 N m for a millisecond would else decide how noisy its joint is, and where a
     simulation under that torque goes.
     """
-    channels = {"q": recording.q} | ({} if recording.tau is None else {"tau": recording.tau})
+    channels = {name: x for name, x in recording.measured.items() if name in _LEAST}
     columns = {(name, j): x for name, channel in channels.items() for j, x in enumerate(channel.T)}
     alone = {(name, j): _alone(x, _LEAST[name]) for (name, j), x in columns.items()}
     found = {place: where for place, where in alone.items() if where.any()}
@@ -40,11 +40,7 @@ def without_glitches(recording: Recording) -> Recording:
     (name, j), where = next(iter(found.items()))
     i, keep = int(np.argmax(where)), ~bad
     return dataclasses.replace(
-        recording,
-        time=recording.time[keep],
-        q=recording.q[keep],
-        qd=None if recording.qd is None else recording.qd[keep],
-        tau=None if recording.tau is None else recording.tau[keep],
+        recording.at(keep),
         repairs={**recording.repairs, LEFT_OUT: int(bad.sum())},
         notes=(
             *recording.notes,

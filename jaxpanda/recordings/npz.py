@@ -3,6 +3,7 @@
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from .libfranka import PANDA_PY_ARRAYS
 from .recording import Origin, Recording
 from .table import of_arrays, recording_of, refuse, within
 
-_ALIASES = {"time": ("time",), "q": ("q",), "dq": ("dq", "qd"), "tau": ("tau",)}
+_ALIASES = {"time": ("time",), "q": ("q",), "dq": ("dq", "qd"), "tau": ("tau",), "tau_motor": ("tau_motor",)}
 
 
 def read_npz(path: Path, reading: Reading) -> list[Recording]:
@@ -46,7 +47,7 @@ def _canonical(path: Path, arrays: dict[str, np.ndarray | None], reading: Readin
     if time.ndim != 1:
         raise InputError(f"{path.name}: array time has the shape {time.shape}, where (n,) is needed")
     shape = (len(time), q.shape[1] if q.ndim == 2 else "joints")
-    for channel in ("q", "dq", "tau"):
+    for channel in CHANNELS[1:]:
         array = arrays[channel]
         if array is not None and (array.shape != shape or array.shape[1] == 0):
             raise InputError(
@@ -55,9 +56,12 @@ def _canonical(path: Path, arrays: dict[str, np.ndarray | None], reading: Readin
     origin = Origin("canonical arrays", {c: c for c in CHANNELS if arrays[c] is not None}, "measured")
     rows, notes = within(path.name, time, reading)
     row = lambda i: f"row {i + rows.start + 1}"
-    q, qd, tau = (None if (array := arrays[c]) is None else array[rows] for c in ("q", "dq", "tau"))
+    q, qd, *torque = (None if (array := arrays[c]) is None else array[rows] for c in CHANNELS[1:])
     assert q is not None
-    recording = Recording(path.name, time[rows], q, qd, tau, path, notes=notes, origin=origin, row=row)
+    tau, motor = torque
+    recording = Recording(
+        path.name, time[rows], q, qd, tau, path, notes=notes, origin=origin, tau_motor=motor, row=row
+    )
     return checked(recording, row)
 
 
@@ -77,6 +81,6 @@ def _array(archive: Mapping[str, np.ndarray], channel: str, path: Path) -> np.nd
 
 def npz_bytes(recording: Recording, name: str) -> bytes:
     """The archive that `read_npz` reads."""
-    arrays = {"time": recording.time, "q": recording.q, "dq": recording.qd, "tau": recording.tau}
-    np.savez_compressed(out := io.BytesIO(), **{name: a for name, a in arrays.items() if a is not None})
+    arrays: dict[str, Any] = {"time": recording.time, **recording.measured}
+    np.savez_compressed(out := io.BytesIO(), **arrays)
     return out.getvalue()

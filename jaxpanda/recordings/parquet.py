@@ -173,7 +173,7 @@ def _array(arrow: ModuleType, content, column: str, width: int | None, name: str
 def parquet_bytes(recording: Recording, name: str) -> bytes:
     """The canonical columns, losslessly compressed."""
     arrow, parquet = pyarrow()
-    names = canonical_names(recording.dof, recording.qd is not None, recording.tau is not None)
+    names = canonical_names(recording)
     table = np.column_stack([recording.time, *recording.channels()])
     out = arrow.BufferOutputStream()
     parquet.write_table(

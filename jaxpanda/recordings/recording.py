@@ -6,12 +6,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..errors import InputError
 
 Torque = Literal["measured", "gravity_removed", "current", "commanded", "motor_side", "unstated"]
 """What a source says its torque is; `measured` is what a recording's must be."""
+
+_CHANNELS = {"q": "q", "dq": "qd", "tau": "tau", "tau_motor": "tau_motor"}
+"""What the canonical CSV calls the channels of the joints, and their fields here."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,11 +68,16 @@ class Recording:
     """Time as it was written [s], where rows were moved to ticks; else None."""
     origin: Origin | None = None
     """What a file called the channels; None where the recording comes from no file."""
+    tau_motor: Float[np.ndarray, "time dof"] | None = None
+    """Torque of the motors at the joints [N m], where it was measured beside `tau`; what the drives lose is in
+    it."""
+    transmitted: Float[np.ndarray, "time dof"] | None = None
+    """Torque that the drives pass on to the links [N m], where `tau` is the motors' and this is known."""
     row: dataclasses.InitVar[Callable[[int], str] | None] = None
     """How the file counts sample `i` (0-based), for messages."""
 
     def __post_init__(self, row: Callable[[int], str] | None):
-        for name in ("time", "q", "qd", "tau", "stamps"):
+        for name in ("time", *_CHANNELS.values(), "stamps"):
             object.__setattr__(self, name, _array(getattr(self, name), name, self.name))
         self._require_shapes()
         row = row or (lambda i: f"row {i + 1}")
@@ -82,8 +90,8 @@ class Recording:
                 f"{self.name}: time has the shape {self.time.shape} and q {self.q.shape}, where (n,) and "
                 "(n, joints) are needed"
             )
-        for name, channel in (("q", self.q), ("dq", self.qd), ("tau", self.tau)):
-            if channel is not None and channel.shape != (self.samples, self.dof):
+        for name, channel in self.measured.items():
+            if channel.shape != (self.samples, self.dof):
                 raise InputError(
                     f"{self.name}: {name} has the shape {channel.shape}, where "
                     f"{(self.samples, self.dof)} is needed, a row for each time and a column for each joint"
@@ -114,9 +122,8 @@ class Recording:
     def columns(self) -> Iterator[tuple[str, Float[np.ndarray, " time"]]]:
         """Each column with the name that the canonical CSV gives it."""
         yield "time", self.time
-        for name, channel in (("q", self.q), ("dq", self.qd), ("tau", self.tau)):
-            if channel is not None:
-                yield from ((f"{name}_{j + 1}", channel[:, j]) for j in range(channel.shape[1]))
+        for name, channel in self.measured.items():
+            yield from ((f"{name}_{j + 1}", channel[:, j]) for j in range(channel.shape[1]))
 
     @property
     def dof(self) -> int:
@@ -131,9 +138,29 @@ class Recording:
         """Sample rate [Hz]: the inverse of the median step."""
         return 1 / float(np.median(np.diff(self.time)))
 
+    @property
+    def measured(self) -> dict[str, Float[np.ndarray, "time dof"]]:
+        """q, and what else was measured of dq, tau and tau_motor, by the names of the canonical CSV."""
+        each = {name: getattr(self, field) for name, field in _CHANNELS.items()}
+        return {name: channel for name, channel in each.items() if channel is not None}
+
     def channels(self) -> list[Float[np.ndarray, "time dof"]]:
-        """q, and qd and tau where they were measured."""
-        return [channel for channel in (self.q, self.qd, self.tau) if channel is not None]
+        """`measured` without the names."""
+        return list(self.measured.values())
+
+    def at(self, rows: slice | Bool[np.ndarray, " time"]) -> "Recording":
+        """Some of its rows."""
+        names = ("time", *_CHANNELS.values(), "transmitted", "stamps")
+        kept = {name: x[rows] for name in names if (x := getattr(self, name)) is not None}
+        return dataclasses.replace(self, **kept)
+
+    def of_link_side(self) -> "Recording":
+        """The same with the torque behind the drives alone."""
+        return dataclasses.replace(self, tau_motor=None)
+
+    def of_motor_side(self) -> "Recording":
+        """The same with the motors' torque alone, in the place of `tau`."""
+        return dataclasses.replace(self, tau=self.tau_motor, tau_motor=None)
 
     def require_dof(self, dof: int) -> None:
         """Refuse a recording of an arm with another number of joints."""

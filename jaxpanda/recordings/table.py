@@ -89,7 +89,8 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
     said = reading.channels()
     source = _source(table, sources, said)
     declared = {} if source is None else source.columns
-    there = {c: where for c, where in declared.items() if c not in said and _there(table.names, where)}
+    free = {c: where for c, where in declared.items() if c not in said and where not in said.values()}
+    there = {c: where for c, where in free.items() if _there(table.names, where)}
     wanted = there | said
     mapping: dict[str, str] = {}
     for name, where in wanted.items():
@@ -107,7 +108,7 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
     time = channels["time"][:, 0]
     if nanoseconds and len(time):  # from the first whole second on, so that no digit is lost
         time = time - np.floor(time[0]) + 1e-9 * content[nanoseconds[0]]
-    absent = [name for name in ("dq", "tau") if name in there and np.all(np.isnan(channels[name]))]
+    absent = [name for name in MEASURED_TOO if name in there and np.all(np.isnan(channels[name]))]
     channels = {name: values for name, values in channels.items() if name not in absent}
     notes = [
         f"{name} is nan throughout, as drivers write what they do not measure: left out" for name in absent
@@ -132,6 +133,7 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
         dict(table.repairs()),
         (*table.notes, *notes, *cut_notes),
         origin=Origin(_named(source, said), taken, torque, says),
+        tau_motor=channels["tau_motor"][rows] if "tau_motor" in channels else None,
         row=row,
     )
     return checked(recording, row)
@@ -176,11 +178,7 @@ def within(name: str, time: Float[np.ndarray, " rows"], reading: Reading) -> tup
 def cut(recording: Recording, reading: Reading) -> Recording:
     """The part of a recording that `--from` and `--to` leave."""
     rows, notes = within(recording.name, recording.time, reading)
-    parts = {
-        name: None if (values := getattr(recording, name)) is None else values[rows]
-        for name in ("time", "q", "qd", "tau", "stamps")
-    }
-    return dataclasses.replace(recording, **parts, notes=(*recording.notes, *notes))
+    return dataclasses.replace(recording.at(rows), notes=(*recording.notes, *notes))
 
 
 def chosen(name: str, episodes: Sequence[str], reading: Reading, what: str = "episodes") -> list[str]:
@@ -252,6 +250,8 @@ def of_arrays(
 
 WIDEST = 1000
 """Columns that one array may have."""
+MEASURED_TOO = CHANNELS[2:]
+"""What may stand beside positions."""
 COLUMNS = 5000
 """Most that a table may have."""
 
@@ -265,7 +265,7 @@ def _source(table: Table, sources: Sequence[Source], said: Mapping[str, str]) ->
     seen = {name.lower() for name in table.names}
     if {"time", "q_1"} <= seen or {"time", "q"} <= said.keys() or "q_1" in said:
         return None
-    if "time" in seen and any(re.fullmatch(r"(q|dq|tau)_\d+", name) for name in seen):
+    if "time" in seen and any(_known(name) for name in seen - {"time"}):
         return None  # all but canonical: `find_channels` says what is wrong
     what = "no columns q_1, q_2, …" if "time" in seen or "time" in said else "no column time"
     likely = _proposal(table.names)
@@ -399,7 +399,8 @@ def _mapping(table: Table, channel: str, where: str) -> dict[str, str]:
             raise InputError(f"--columns {channel}=: {channel} cannot be left out")
         return {}
     plain, unit = (where, "") if where in table.names else _split_unit(where)
-    base = channel.partition("_")[0]
+    stem, _, joint = channel.rpartition("_")
+    base = stem if joint.isdecimal() else channel
     if unit and unit not in UNITS.get(base, {}):
         has = ", ".join(UNITS[base]) if base in UNITS else "none here; torque's is said by --torque-unit"
         raise InputError(f"--columns {channel}={where}: {unit} is no unit of {base}; its units are {has}")
@@ -408,7 +409,7 @@ def _mapping(table: Table, channel: str, where: str) -> dict[str, str]:
         raise InputError(
             f"{table.name}: no column {plain!r} (asked for as {channel}); it has {listed(table.names)}"
         )
-    if channel == "time" or "_" in channel:
+    if channel == "time" or joint.isdecimal():
         if len(columns) > 1:
             raise InputError(f"{table.name}: {plain!r} is {len(columns)} columns, where {channel} is one")
         return {channel: columns[0]}
@@ -440,7 +441,7 @@ def find_channels(names: Sequence[str], file: str, columns: Mapping[str, str]) -
             f"{file}: no column time; it has {listed(names)}, where {canonical(7)} is needed{_MAP}"
         )
     found: dict[str, list[int]] = {"time": [seen.index("time")]}
-    for channel in ("q", "dq", "tau"):
+    for channel in ("q", *MEASURED_TOO):
         joints = {
             int(m[1]): i
             for i, name in enumerate(seen)
@@ -451,7 +452,7 @@ def find_channels(names: Sequence[str], file: str, columns: Mapping[str, str]) -
     if "q" not in found:
         raise InputError(f"{file}: no columns q_1, q_2, …; it has {listed(names)}{_MAP}")
     dof = len(found["q"])
-    for channel in ("dq", "tau"):
+    for channel in MEASURED_TOO:
         if channel in found and len(found[channel]) != dof:
             raise InputError(
                 f"{file}: {dof} columns q_1 ... q_{dof} but {len(found[channel])} columns {channel}_1 ... "
@@ -464,7 +465,7 @@ _MAP = "; rename them, or say which is which, as --columns time=t q=pos_{j} tau=
 
 
 def _known(name: str) -> bool:
-    return name == "time" or re.fullmatch(r"(q|dq|tau)_\d+", name) is not None
+    return name == "time" or re.fullmatch(r"(q|dq|tau|tau_motor)_\d+", name) is not None
 
 
 def _complete(joints: list[int], channel: str, file: str) -> list[int]:
@@ -488,7 +489,6 @@ def canonical(dof: int) -> str:
     return f"time,q_1,…,q_{dof},dq_1,…,dq_{dof},tau_1,…,tau_{dof}"
 
 
-def canonical_names(dof: int, qd: bool, tau: bool) -> list[str]:
+def canonical_names(recording: Recording) -> list[str]:
     """The columns of a recording, in order."""
-    channels = ["q"] + ["dq"] * qd + ["tau"] * tau
-    return ["time"] + [f"{channel}_{j + 1}" for channel in channels for j in range(dof)]
+    return [name for name, _ in recording.columns()]

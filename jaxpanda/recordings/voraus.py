@@ -13,6 +13,7 @@ VORAUS = Source(
         "q": "joint_position_{j}",
         "dq": "joint_velocity_{j}",
         "tau": "torque_sensor_a_{j}",
+        "tau_motor": "motor_torque_{j}",
     },
     "measured",
     "torque_sensor_a and torque_sensor_b measure the joint's torque, gravity included; motor_torque is the "
