@@ -39,6 +39,8 @@ class Proposal:
     deviation: Float[np.ndarray, " n"]
     steps: tuple[float, ...]
     """First steps of a refinement, one a shape parameter."""
+    shared: float = 0.0
+    """What of the evidence comes of other joints that have the effect [nats]."""
 
     @property
     def key(self) -> tuple[str, tuple[int, ...]]:

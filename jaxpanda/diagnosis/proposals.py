@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from ..effects import AbstractEffect, AbstractJointEffect
+from .alike import shared
 from .credible import is_credible
 from .events import Proposal, ripple, spots, windows
 from .evidence import Design, Noise, log_mean_exp
@@ -47,7 +48,8 @@ def ranked(
         *spots(problem, design, noise, where),
         *ripple(problem, design, noise, where),
     ]
-    kept = [p for p in before if is_elsewhere(p.effect, where)]
+    laws = [t.effect for t in design.terms]
+    kept = [beside(p, laws, problem.dof) for p in before if is_elsewhere(p.effect, where)]
     events = [p for p in before if p.effect.bound_to_recording]
     likeliest = max((p.evidence for p in scanned), default=0.0)
     if events and likeliest > _AHEAD * max(0.0, *(p.evidence for p in events)):
@@ -61,7 +63,7 @@ def ranked(
         times = 1 + (
             held[p.key[0]] if p.effect.repeats else 0
         )  # the third push is less likely than the first
-        p = with_prior(p, many[p.key[0]], times)
+        p = beside(with_prior(p, many[p.key[0]], times), laws, problem.dof)
         if p.key not in best or p.evidence > best[p.key].evidence:
             best[p.key] = p
     first, rest = [], kept
@@ -103,6 +105,13 @@ def with_prior(proposal: Proposal, places: int, times: int = 1) -> Proposal:
     """A proposal with what was thought of it beforehand, at one of so many places and for so many times."""
     prior = times * proposal.effect.prior - float(np.log(places))
     return dataclasses.replace(proposal, evidence=proposal.evidence + prior)
+
+
+def beside(proposal: Proposal, effects: Sequence[AbstractEffect], dof: int) -> Proposal:
+    """A proposal with what effects at other joints say of it beforehand."""
+    gained = shared((*effects, proposal.effect), dof) - shared(effects, dof)
+    evidence = proposal.evidence - proposal.shared + gained
+    return dataclasses.replace(proposal, evidence=evidence, shared=gained)
 
 
 def is_elsewhere(effect: AbstractEffect, joints: Collection[int]) -> bool:

@@ -13,10 +13,12 @@ import scipy.special
 
 from ..arms.arm import Arm
 from ..effects import AbstractJointEffect
+from .alike import TEMPERATURE, shared
 from .credible import fitted
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem, Term
+from .proposals import beside as at_others
 from .proposals import by_place, grids, plainer, ranked, with_prior
 from .shapes import evidence_of, first_steps, refine
 from .state import (
@@ -36,9 +38,6 @@ OPPOSED = 20.0
 """How many times the torque of a law its parts may be."""
 WORTH = 1.03
 """By which the squared error of predicted torque must be smaller than with the user's model."""
-TEMPERATURE = 3.0
-"""By which differences of log probability are divided where models are weighed against each other: noise is not
-quite what it is taken for, and counts as evidence what is none."""
 BETTER = 1.0
 """By how much a model must be likelier to be worth a step [nats]."""
 UNLIKELY = -10.0
@@ -120,7 +119,7 @@ def climb(problem: Problem, state: State, say: Any, *, free: bool = True, met: S
 def taken(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> Term:
     """A proposal as a term beside what a design holds, with its discrepancy."""
     c, _ = fitted(problem, design, noise, proposal)
-    prior = proposal.evidence - proposal.best + proposal.effect.form_prior
+    prior = proposal.evidence - proposal.shared - proposal.best + proposal.effect.form_prior
     return problem.term(proposal.effect, proposal.deviation, c, noise.std, prior)
 
 
@@ -134,14 +133,16 @@ def choices(
     """What the foremost proposals bring with their discrepancies, beside these terms; the likeliest first."""
     if not proposals:
         return []
-    own, out = evidence(problem, terms, design, noise), []
+    laws, out = [t.effect for t in terms], []
+    own = evidence(problem, terms, design, noise) + shared(laws, problem.dof)
     for p in _likeliest(proposals):
         for form in (p, *plainer(problem, design, noise, p)):
             term = taken(problem, design, noise, form)
             more = problem.design((*terms, term), noise)
             if is_possible(problem.arm, term, more):
                 found = evidence(problem, (*terms, term), more, noise)
-                out.append((found - own + term.prior, (term,)))
+                paid = term.prior + shared((*laws, term.effect), problem.dof)
+                out.append((found - own + paid, (term,)))
             problem.forget(term)
     return sorted(out, key=lambda choice: -choice[0])
 
@@ -400,7 +401,8 @@ def everywhere(problem: Problem, noise: Noise) -> list[Term]:
             left = [g for g in groups if (g.name, g.effects[0].joints) not in held]
             found = []
             for p in grids(problem, design, noise, left) if left else []:
-                p = refine(problem, design, noise, with_prior(p, problem.dof))
+                p = at_others(with_prior(p, problem.dof), [t.effect for t in terms], problem.dof)
+                p = refine(problem, design, noise, p)
                 found += choices(problem, terms, design, noise, [p]) if p.evidence > 0 else []
             best = max(found, key=lambda choice: choice[0], default=None)
             if best is None or best[0] < BETTER:

@@ -8,6 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from .alike import shared
 from .evidence import Design, Noise, stretches
 from .problem import Problem, Term
 
@@ -40,7 +41,7 @@ class State:
             here = r != 0
             counted += 0.5 * float(r @ r) + np.count_nonzero(here) * float(np.log(self.noise.sigma[j]))
             counted += self.noise.widened(j, here)
-        return self.design.log_evidence - counted + sum(t.prior for t in self.terms)
+        return self.design.log_evidence - counted + paid(self.terms, len(self.noise.std))
 
 
 def start(problem: Problem) -> State:
@@ -202,8 +203,13 @@ def beside(problem: Problem, state: State, which: Collection[int], rest: Design)
     """Log evidence of the model without some of its terms, `rest`, less their priors: what the whole must exceed
     for them to be worth it."""
     others = [t for i, t in enumerate(state.terms) if i not in which]
-    paid = sum(state.terms[i].prior for i in which)
-    return evidence(problem, others, rest, state.noise) - paid
+    less = paid(others, problem.dof) - paid(state.terms, problem.dof)
+    return evidence(problem, others, rest, state.noise) + less
+
+
+def paid(terms: Sequence[Term], dof: int) -> float:
+    """Log prior odds of these terms together, less what the search for their shapes has cost [nats]."""
+    return sum(t.prior for t in terms) + shared([t.effect for t in terms], dof)
 
 
 def evidence(problem: Problem, terms: Sequence[Term], design: Design, noise: Noise) -> float:

@@ -27,6 +27,7 @@ class Armature(AbstractInstantEffect):
 
     name: ClassVar[str] = "armature"
     family: ClassVar[str] = "drive"
+    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "acceleration"
     reveals: ClassVar[str] = "high accelerations in several poses of the joints beyond"
 

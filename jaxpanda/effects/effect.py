@@ -96,6 +96,8 @@ class AbstractEffect(eqx.Module):
     periods, for what comes and goes."""
     free: ClassVar[bool] = False
     """Whether it is a curve that fits what has no law."""
+    alike: ClassVar[bool] = False
+    """Whether joints of an arm have it alike, as gears of one make: found in one, it is likelier in others."""
     repeats: ClassVar[bool] = False
     """Whether it can act several times over at one place."""
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "plant"

@@ -52,6 +52,7 @@ class ViscousFriction(AbstractInstantEffect):
 
     name: ClassVar[str] = "viscous_friction"
     family: ClassVar[str] = "friction"
+    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "velocity"
     reveals: ClassVar[str] = "runs at four or more constant speeds, in both directions"
     prior: ClassVar[float] = COMMON
@@ -88,6 +89,7 @@ class CoulombFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "coulomb_friction"
     family: ClassVar[str] = "friction"
+    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "velocity"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("v0", "rad/s", 1e-3, 0.06),)
     reveals: ClassVar[str] = "reversals, with dwells between them"
@@ -135,6 +137,7 @@ class PowerLawFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "power_law_friction"
     family: ClassVar[str] = "friction"
+    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "velocity"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("exponent", "1", 0.35, 3.0),)
     reveals: ClassVar[str] = ViscousFriction.reveals
@@ -192,6 +195,7 @@ class AsymmetricFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "asymmetric_friction"
     family: ClassVar[str] = "friction"
+    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "velocity"
     dissipates: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)
@@ -303,6 +307,7 @@ class LoadDependentFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "load_dependent_friction"
     family: ClassVar[str] = "friction"
+    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "|load|, turned by direction"
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH, Shape("exponent", "1", 0.6, 1.6))
     reveals: ClassVar[str] = "the same speed in loaded and unloaded poses; with and without payload"

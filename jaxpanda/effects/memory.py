@@ -45,6 +45,7 @@ class PreslidingHysteresis(AbstractMemoryEffect):
 
     name: ClassVar[str] = "presliding_hysteresis"
     family: ClassVar[str] = "friction"
+    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "reversal, turned by direction"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("breakaway_distance", "rad", 1e-4, 0.2),)
     reveals: ClassVar[str] = "slow reversals of half to five breakaway distances"

@@ -1,0 +1,58 @@
+"""What joints have alike is likelier at one more of them; what they do not is as likely at each."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from jaxpanda.diagnosis.alike import TEMPERATURE, shared
+from jaxpanda.effects.drive import JointSpring
+from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
+from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.effects.stribeck import StribeckFriction
+
+DOF = 7
+
+
+def odds(law, effects) -> float:
+    """Log prior odds of one more, beside the others, its price for the place left out."""
+    return law.prior + law.form_prior + shared((*effects, law), DOF) - shared(effects, DOF)
+
+
+@pytest.mark.parametrize("law", [lambda j: CoulombFriction(j, 0.01), ViscousFriction, TorqueOffset])
+def test_the_first_joint_pays_in_full_and_each_further_one_less(law):
+    told = [odds(law(k), [law(j) for j in range(k)]) for k in range(DOF)]
+    assert told[0] == law(0).prior
+    assert told[1] == pytest.approx(-TEMPERATURE * np.log(DOF - 1))
+    assert all(a <= b for a, b in itertools.pairwise(told))
+    assert told[-1] == 0.0  # never likelier beforehand than not: what nothing shows is not there
+
+
+def test_the_order_in_which_joints_are_found_does_not_matter():
+    effects = [
+        CoulombFriction(0, 0.01),
+        StribeckFriction(3, 0.05, 0.01, 2.0, form="whole"),
+        StribeckFriction(5, 0.05, 0.01, 2.0, form="viscous"),
+        ViscousFriction(0),
+    ]
+    told = {round(shared(order, DOF), 9) for order in itertools.permutations(effects)}
+    assert len(told) == 1
+    assert told.pop() > 0
+
+
+def test_a_law_counts_with_the_parts_that_it_holds():
+    """Stribeck's curve holds a Coulomb level: found at one joint, it makes that of another likelier."""
+    curve = StribeckFriction(3, 0.05, 0.01, 2.0, form="whole")
+    assert odds(CoulombFriction(1, 0.01), [curve]) == odds(
+        CoulombFriction(1, 0.01), [CoulombFriction(3, 0.01)]
+    )
+    assert odds(ViscousFriction(1), [curve]) == ViscousFriction.prior
+
+
+def test_what_each_joint_has_of_its_own_is_not_shared():
+    spring, *others = (JointSpring(j, "linear") for j in range(DOF))
+    assert odds(spring, others) == spring.prior + spring.form_prior
+
+
+def test_the_same_joint_twice_is_no_second_joint():
+    assert shared([CoulombFriction(2, 0.01), StribeckFriction(2, 0.05, 0.01, 2.0, form="whole")], DOF) == 0.0
