@@ -178,6 +178,12 @@ def test_torque_of_the_motors_is_left_out_where_not_all_recordings_have_it():
     assert any("tau_motor is not used" in note for note in found.notes)
 
 
+def test_torque_of_the_motors_alone_is_refused_with_what_would_take_it():
+    alone = dataclasses.replace(measured(10), tau=None)
+    with pytest.raises(InputError, match=r"--columns tau=tau_motor_\{j\}"):
+        diagnose(None, [alone])
+
+
 def test_torque_of_the_motors_that_never_changes_is_refused():
     recording = measured(10)
     stuck = recording.tau_motor.copy()

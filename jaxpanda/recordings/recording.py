@@ -174,6 +174,8 @@ class Recording:
         """The measured torque; refuse a motion."""
         if self.tau is None:
             said = f" ({self.origin.says})" if self.origin and self.origin.says else ""
+            if self.tau_motor is not None:
+                said = "; --columns tau=tau_motor_{j} takes the motors' torque for it"
             raise InputError(
                 f"{self.name}: no columns tau_1 ... tau_{self.dof}: this needs measured joint torques, not a "
                 f"motion{said}"
