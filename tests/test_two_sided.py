@@ -12,6 +12,7 @@ from jaxpanda import Arm, Corrected, Recording, replay
 from jaxpanda.__main__ import main
 from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.diagnosis import Diagnosis, TwoSided, diagnose, predict_sides
+from jaxpanda.diagnosis.resting import AtRest
 from jaxpanda.errors import InputError
 from jaxpanda.recordings import load, save
 
@@ -176,6 +177,23 @@ def test_torque_of_the_motors_is_left_out_where_not_all_recordings_have_it():
     assert isinstance(found, Diagnosis)
     assert found.verdict == "consistent"
     assert any("tau_motor is not used" in note for note in found.notes)
+
+
+def test_an_arm_at_rest_keeps_the_friction_of_the_file(tmp_path):
+    """No drive moves, so that tau alone tells; and the file stays what it is."""
+    path = tmp_path / "arm.xml"
+    path.write_text(panda_mjcf().replace("<joint name=", '<joint frictionloss="0.4" name='))
+    moving, rng = measured(11, drive=False), np.random.default_rng(11)
+    q = np.repeat(moving.q[:1], moving.samples, 0)
+    data, model = mujoco.MjData(engine()), engine()
+    data.qpos[:7] = q[0]
+    mujoco.mj_inverse(model, data)
+    tau = data.qfrc_inverse[:7] + NOISE * rng.normal(size=q.shape)
+    still = dataclasses.replace(moving, q=q, qd=0 * q, tau=tau, tau_motor=tau + 0.3)
+    found = diagnose(path, [still])
+    assert isinstance(found, AtRest)
+    assert found.verdict == "consistent"
+    np.testing.assert_array_equal(found.corrected.arm.frictionloss, 0.4)
 
 
 def test_torque_of_the_motors_alone_is_refused_with_what_would_take_it():

@@ -3,11 +3,13 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from ..arms import markup
+from ..arms.arm import Arm
 from ..arms.export import panda_mjcf
 from ..arms.mjcf import with_gravity
 from ..arms.model_file import Model
@@ -24,8 +26,10 @@ from .host import on_host
 from .meaning import Misread, misread
 from .resting import AtRest, judge, rests
 from .traces import Trace, prepare, work_rate
-from .two_sided import TwoSided, both, drive_alone, links_alone, on_drives, on_motors, passed_on
+from .two_sided import TwoSided, both, drive_alone, links_alone, notes_of, on_drives, on_motors, passed_on
 from .written import file_with
+
+Found = TypeVar("Found", AtRest, Misread)
 
 
 @on_host
@@ -83,13 +87,13 @@ def diagnose(
     suspect = [trace for trace, on in zip(traces, active, strict=True) if on]
     if all(rests(trace) for trace in suspect):
         healthy = [trace for trace, on in zip(traces, active, strict=True) if not on]
-        return judge(suspect, healthy, source, knowledge)
+        return _as_it_is(judge(suspect, healthy, source, knowledge), arm)
     for recording in loaded:
         _require_live_torque(recording)
     in_question = [one.of_link_side() for one, on in zip(loaded, active, strict=True) if on]
     wrongly_read = misread(in_question, suspect, source, knowledge)
     if wrongly_read is not None:
-        return wrongly_read
+        return _as_it_is(wrongly_read, arm)
     found, kept = sought(link_arm, source, in_question, traces, active, knowledge, catalogue, progress)
     if not two:
         document, warnings = file_with(source, kept, found.problem, in_question)
@@ -104,7 +108,13 @@ def diagnose(
     )
     whole = both(arm, kept, drives_kept)
     document, warnings = file_with(source, whole, drives.problem, in_question)
-    return TwoSided(found, drives, both(arm, found.corrected, drives.corrected), document, warnings)
+    corrected, notes = both(arm, found.corrected, drives.corrected), notes_of(found, drives, warnings)
+    return TwoSided(found, drives, corrected, document, warnings, notes)
+
+
+def _as_it_is(found: Found, arm: Arm) -> Found:
+    """With the user's arm, drives and all, where it was compared without them."""
+    return dataclasses.replace(found, corrected=dataclasses.replace(found.corrected, arm=arm))
 
 
 def _without_motors(recording: Recording) -> Recording:

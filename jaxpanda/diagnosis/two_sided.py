@@ -52,20 +52,9 @@ class TwoSided:
     written: markup.Document
     warnings: tuple[str, ...]
     """What the corrected file cannot hold."""
+    notes: tuple[str, ...]
     sources: tuple[Mapping[str, str], ...] = ()
     replays: tuple[Mapping[str, Any], ...] = ()
-    notes: tuple[str, ...] = ()
-
-    def __post_init__(self):
-        if not self.notes:
-            told = (
-                "damping, frictionloss and armature of your file were taken for the drives', between tau_motor"
-                " and tau; corrected.xml and simulations have the torque of the motors",
-                *self.link.notes,
-                *self.drive.notes,
-                *self.warnings,
-            )
-            object.__setattr__(self, "notes", tuple(dict.fromkeys(told)))
 
     @property
     def source(self) -> MjcfSource:
@@ -150,6 +139,15 @@ class TwoSided:
             }
             files.write_json(scratch / FILE, whole)
         return missing_assets(self.written, Path(folder))
+
+
+def notes_of(link: Diagnosis, drive: Diagnosis, warnings: Sequence[str]) -> tuple[str, ...]:
+    """Those of both sides, each once."""
+    first = (
+        "damping, frictionloss and armature of your file were taken for the drives', between tau_motor and tau;"
+        " corrected.xml and simulations have the torque of the motors"
+    )
+    return tuple(dict.fromkeys((first, *link.notes, *drive.notes, *warnings)))
 
 
 def _joined(verdicts: set[str]) -> str:
