@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxpanda.diagnosis.alike import TEMPERATURE, shared
-from jaxpanda.effects.drive import JointSpring
+from jaxpanda.effects.drive import Armature, JointSpring
 from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.effects.stribeck import StribeckFriction
@@ -19,7 +19,7 @@ def odds(law, effects) -> float:
     return law.prior + law.form_prior + shared((*effects, law), DOF) - shared(effects, DOF)
 
 
-@pytest.mark.parametrize("law", [lambda j: CoulombFriction(j, 0.01), ViscousFriction, TorqueOffset])
+@pytest.mark.parametrize("law", [lambda j: CoulombFriction(j, 0.01), ViscousFriction, Armature])
 def test_the_first_joint_pays_in_full_and_each_further_one_less(law):
     told = [odds(law(k), [law(j) for j in range(k)]) for k in range(DOF)]
     assert told[0] == law(0).prior
@@ -50,8 +50,9 @@ def test_a_law_counts_with_the_parts_that_it_holds():
 
 
 def test_what_each_joint_has_of_its_own_is_not_shared():
-    spring, *others = (JointSpring(j, "linear") for j in range(DOF))
-    assert odds(spring, others) == spring.prior + spring.form_prior
+    for kind in (lambda j: JointSpring(j, "linear"), TorqueOffset):
+        one, *others = (kind(j) for j in range(DOF))
+        assert odds(one, others) == one.prior + one.form_prior
 
 
 def test_the_same_joint_twice_is_no_second_joint():

@@ -323,6 +323,17 @@ def test_what_was_refitted_can_be_built_and_simulated(own_panda):
     assert buildable(source, heavier, problem) is heavier
 
 
+@pytest.mark.parametrize("beside", [0.0, 5.0])
+def test_links_that_no_body_has_give_way_unless_the_user_s_model_is_nearer(own_panda, beside):
+    """A link of negative mass, and recordings that the user's model leaves this much of [N m]."""
+    arm, source, problem = own_panda
+    lighter = changed(arm, -2.0 * np.eye(7, 10) * np.eye(7)[6][:, None])
+    assert not are_buildable(np.asarray(lighter.native.standard))
+    traces = tuple(dataclasses.replace(t, tau=t.tau + beside) for t in problem.traces)
+    built = buildable(source, lighter, dataclasses.replace(problem, traces=traces))
+    assert are_buildable(np.asarray(built.native.standard)) == (beside > 0)
+
+
 def test_what_the_file_cannot_hold_is_said_once(written):
     _, notes = written(*(PreslidingHysteresis(j, 0.01, "dahl whole") for j in (1, 2, 4)))
     assert len([note for note in notes if "cannot hold" in note]) == 1

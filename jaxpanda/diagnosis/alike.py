@@ -1,9 +1,9 @@
 r"""Prior odds of what joints have alike.
 
-Gears, motors and sensors of an arm are mostly of one make: where a model lacks the friction of one joint it
-lacks that of others. So the share of joints that an effect is at is unknown, and the same for all: with a flat
-prior over it, one more than k of n joints has odds of k : n - k beforehand. The first has the odds of the
-effect's class.
+Gears and motors of an arm are mostly of one make: where a model lacks the friction of one joint it lacks that of
+others. So the share of joints that an effect is at is unknown, and the same for all: with a flat prior over it,
+one more than k of n joints has odds of k : n - k beforehand. The first has the odds of the effect's class. What a
+sensor is off by is its own.
 """
 
 from collections import defaultdict

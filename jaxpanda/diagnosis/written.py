@@ -30,13 +30,16 @@ _WORSE = 1.1
 
 
 def buildable(source: MjcfSource, corrected: Corrected, problem: Problem) -> Corrected:
-    """The same torque from links that can be built, so that the arm can be simulated; where there are such."""
+    """The nearest torque from links that can be built, so that the arm can be simulated; the links as they are
+    where that differs beyond what can be overseen, and leaves more of a joint than the user's model does."""
     standard = np.asarray(corrected.native.standard)
     carried = np.stack([link.lumped_standard for link in source.links])
     if not np.any(np.asarray(corrected.change)) or are_buildable(standard - carried):
         return corrected
     built, off = _nearest(source, standard, problem)
-    if np.any(off > UNSEEN * problem.noise(()).std):
+    noise, weights = problem.noise(()).std, np.concatenate([t.weights for t in problem.traces])
+    users = np.sqrt(np.mean((weights * np.concatenate(problem.residual)) ** 2, 0))
+    if np.any((off > UNSEEN * noise) & (np.hypot(noise, off) > users)):
         return corrected
     return eqx.tree_at(lambda c: c.change, corrected, corrected.change + (built - standard))
 

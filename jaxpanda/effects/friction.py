@@ -195,7 +195,6 @@ class AsymmetricFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "asymmetric_friction"
     family: ClassVar[str] = "friction"
-    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "velocity"
     dissipates: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH,)

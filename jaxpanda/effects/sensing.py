@@ -21,7 +21,6 @@ class TorqueOffset(AbstractInstantEffect):
 
     name: ClassVar[str] = "torque_offset"
     family: ClassVar[str] = "sensor"
-    alike: ClassVar[bool] = True
     reveals: ClassVar[str] = "rests, and poses on both sides of the joint's zero of gravity"
     prior: ClassVar[float] = COMMON
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
@@ -59,7 +58,6 @@ class TorqueGain(AbstractInstantEffect):
 
     name: ClassVar[str] = "torque_gain"
     family: ClassVar[str] = "sensor"
-    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "model torque"
     reveals: ClassVar[str] = "a known load at the flange"
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
