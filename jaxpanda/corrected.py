@@ -252,12 +252,18 @@ def read(
     Raises:
         InputError: there is none, or not as `diagnose` writes it, or an effect is of an unknown class.
     """
+    document, path = _document(folder)
+    return _of(document, path, effects)
+
+
+def _document(folder: str | Path) -> tuple[Mapping[str, Any], Path]:
+    """What `diagnose` saved of the corrected arm in a folder, and where."""
     path = Path(folder) / FILE
     files.settle(folder)
     document = read_json(path)
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise InputError(f"{path}: is no corrected model; a folder that `diagnose` wrote is needed")
-    return _of(document, path, effects)
+    return document, path
 
 
 def _of(
@@ -285,9 +291,8 @@ def read_sides(
     Raises:
         InputError: as `read`.
     """
-    path = Path(folder) / FILE
-    read(folder, effects)
-    sides = read_json(path).get("sides")
+    document, path = _document(folder)
+    sides = document.get("sides")
     return () if not sides else tuple(_of(sides[side], path, effects) for side in ("link", "drive"))
 
 

@@ -102,6 +102,13 @@ def predicted(
     return out[cutoffs[0]][0], torque
 
 
+def at_rows(
+    recording: Recording, time: Float[np.ndarray, " time"], torque: Float[np.ndarray, "time dof"]
+) -> Float[np.ndarray, "rows dof"]:
+    """Torque on a grid, for each row of a recording."""
+    return np.stack([np.interp(recording.time, time, column) for column in torque.T], 1)
+
+
 def _beginning(recording: Recording) -> Recording:
     """The first `LONG` of a recording."""
     count = int(np.searchsorted(recording.time, recording.time[0] + LONG, "right"))

@@ -28,7 +28,7 @@ from .as_recorded import as_recorded, misleading
 from .calibration import SMALL, are_told, calibrated, is_large
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
-from .finding import Finding, Fit
+from .finding import VERDICTS, Finding, Fit
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .posterior import posterior_of
@@ -139,13 +139,10 @@ class Diagnosis:
 
     def lines(self) -> list[str]:
         """Verdict and findings in plain sentences."""
-        sentence = {
-            "consistent": "The simulation agrees with the recordings: what differs is within noise.",
-            "explained": "The simulation is missing physics that explains the difference.",
-            "partly_explained": "The simulation is missing physics, and part of it stays unexplained.",
-            "unexplained": "The simulation differs from the recordings in a way that no effect explains.",
-        }[self.verdict]
-        return [sentence, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]
+        return [
+            VERDICTS[self.verdict],
+            *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings),
+        ]
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
         """Write diagnosis.json, corrected.xml with what it includes, corrected.json, and posterior.npz;

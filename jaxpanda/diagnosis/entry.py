@@ -20,7 +20,7 @@ from ..errors import InputError, require_x64
 from ..recordings import Recording, distinct, load
 from ..session import Say, silent
 from . import knowledge as knowledge_
-from .as_recorded import predicted
+from .as_recorded import at_rows, predicted
 from .diagnosis import Diagnosis, sought
 from .host import on_host
 from .meaning import Misread, misread
@@ -168,16 +168,11 @@ def predict_sides(
     sides = read_sides(folder, effects)
     corrected, noise = sides[0] if sides else read(folder, effects)
     recording.require_dof(corrected.arm.dof)
-    tau = _at_rows(recording, *predicted(recording.of_link_side(), corrected, noise))
+    trace, torque = predicted(recording.of_link_side(), corrected, noise)
+    tau = at_rows(recording, trace.motion.time, torque)
     if not sides:
         return tau, None
     passed = passed_on(corrected, recording, tau)
     view = dataclasses.replace(recording, tau=None, tau_motor=None, transmitted=passed)
-    return tau, _at_rows(recording, *predicted(view, *sides[1]))
-
-
-def _at_rows(
-    recording: Recording, trace: Trace, tau: Float[np.ndarray, "time dof"]
-) -> Float[np.ndarray, "rows dof"]:
-    """Torque on the grid of a prediction, for each row of the motion."""
-    return np.stack([np.interp(recording.time, trace.motion.time, column) for column in tau.T], 1)
+    trace, torque = predicted(view, *sides[1])
+    return tau, at_rows(recording, trace.motion.time, torque)

@@ -12,6 +12,14 @@ from ..effects import CATALOGUE
 FAMILIES = {**{effect.name: effect.family for effect in CATALOGUE}, "torque_meaning": "meaning"}
 """The family of each effect that a finding may have."""
 
+VERDICTS = {
+    "consistent": "The simulation agrees with the recordings: what differs is within noise.",
+    "explained": "The simulation is missing physics that explains the difference.",
+    "partly_explained": "The simulation is missing physics, and part of it stays unexplained.",
+    "unexplained": "The simulation differs from the recordings in a way that no effect explains.",
+}
+"""Each verdict as a sentence."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Finding:

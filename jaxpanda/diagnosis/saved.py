@@ -1,5 +1,6 @@
 """The files that every diagnosis leaves, whatever it found."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -23,14 +24,19 @@ class Answer(Protocol):
     def to_json(self) -> dict[str, Any]: ...
 
 
-def write(found: Answer, folder: str | Path) -> None:
-    """diagnosis.json, corrected.xml with what it includes, and corrected.json, as one set.
+def with_noise(corrected: Corrected, fit: Fit) -> dict[str, Any]:
+    """corrected.json: the arm, and the noise of its torque."""
+    return {**corrected.to_json(), "torque_noise": [float(v) for v in fit.noise_floor]}
+
+
+def write(found: Answer, folder: str | Path, corrected: Mapping[str, Any] | None = None) -> None:
+    """diagnosis.json, corrected.xml with what it includes, and corrected.json, as one set; `corrected`: the last,
+    where it holds more than the corrected arm.
 
     Raises:
         InputError: a file of such a name stands there that no earlier diagnosis left; nothing is written.
     """
-    noise = [float(v) for v in found.fit.noise_floor]
     with files.output_folder(folder, KIND) as scratch:
         write_document(found.written, scratch / XML)
         files.write_json(scratch / KIND.names[0], found.to_json())
-        files.write_json(scratch / FILE, {**found.corrected.to_json(), "torque_noise": noise})
+        files.write_json(scratch / FILE, corrected or with_noise(found.corrected, found.fit))

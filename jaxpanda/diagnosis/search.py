@@ -18,8 +18,7 @@ from .credible import fitted
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem, Term
-from .proposals import beside as at_others
-from .proposals import by_place, grids, plainer, ranked, with_prior
+from .proposals import at_others, by_place, grids, plainer, ranked, with_prior
 from .shapes import evidence_of, first_steps, refine
 from .state import (
     State,

@@ -21,17 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .. import files
 from ..arms import markup
 from ..arms.arm import Arm
 from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
-from ..corrected import FILE, KIND, Corrected
+from ..corrected import Corrected
 from ..effects import AbstractEffect
 from ..recordings import Recording
 from . import saved
+from .as_recorded import at_rows
 from .diagnosis import Diagnosis
-from .finding import Finding, Fit
+from .finding import VERDICTS, Finding, Fit
 
 BEHIND = frozenset({"load", "contact"})
 """Families of what acts on the links, behind every drive."""
@@ -110,14 +110,10 @@ class TwoSided:
     def lines(self) -> list[str]:
         """Verdict and findings in plain sentences."""
         where = {"link": "Behind the drives", "drive": "In the drives"}
-        first = {
-            "consistent": "The simulation agrees with the recordings, in the drives and behind them.",
-            "explained": "The simulation is missing physics that explains the difference.",
-            "partly_explained": "The simulation is missing physics, and part of it stays unexplained.",
-            "unexplained": "The simulation differs from the recordings in a way that no effect explains.",
-        }[self.verdict]
         told = [f"{where[f.side]}: {f.summary} Confidence {f.confidence:.2f}." for f in self.findings]
-        return [first, *told]
+        if self.verdict == "consistent":
+            return ["The simulation agrees with the recordings, in the drives and behind them.", *told]
+        return [VERDICTS[self.verdict], *told]
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
         """Write diagnosis.json, corrected.xml with what it includes, and corrected.json, which has both sides
@@ -127,17 +123,11 @@ class TwoSided:
             InputError: a file of such a name stands there that no earlier diagnosis left; nothing is written.
         """
         sides = {
-            side: {**found.corrected.to_json(), "torque_noise": [float(v) for v in found.fit.noise_floor]}
+            side: saved.with_noise(found.corrected, found.fit)
             for side, found in (("link", self.link), ("drive", self.drive))
         }
-        with files.output_folder(folder, KIND) as scratch:
-            saved.write(self, scratch)
-            whole = {
-                **self.corrected.to_json(),
-                "torque_noise": sides["drive"]["torque_noise"],
-                "sides": sides,
-            }
-            files.write_json(scratch / FILE, whole)
+        whole = {**saved.with_noise(self.corrected, self.drive.fit), "sides": sides}
+        saved.write(self, folder, whole)
         return missing_assets(self.written, Path(folder))
 
 
@@ -185,7 +175,7 @@ def on_motors(found: Diagnosis, recordings: Sequence[Recording]) -> list[Recordi
     problem = found.problem
     each = zip(recordings, problem.traces, found.residuals(), problem.active, strict=True)
     for recording, trace, (_, time, _, left), on in each:
-        fitted = np.stack([np.interp(recording.time, time, x) for x in (trace.tau - left).T], 1)
+        fitted = at_rows(recording, time, trace.tau - left)
         measured = recording.require_tau()
         if on:
             fitted, measured = (passed_on(found.corrected, recording, tau) for tau in (fitted, measured))
