@@ -1,6 +1,8 @@
 """Random arms and states, and the same arms in other people's engines."""
 
 import json
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,12 @@ def result(path: Path) -> dict[str, Any]:
     schema = Path(__file__).parents[1] / "docs" / "schemas" / f"{path.stem}.schema.json"
     jsonschema.Draft202012Validator(json.loads(schema.read_text())).validate(document)
     return document
+
+
+def run_script(folder: Path, *arguments: object) -> str:
+    """What a script in a folder prints, which must succeed."""
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
 def random_chain(seed: int, dof: int) -> Chain:
