@@ -2,8 +2,9 @@
 
     python kernels/benchmarks/rnea.py                      # prints the table
     python kernels/benchmarks/rnea.py --baseline           # and replaces the committed baseline
-    python kernels/benchmarks/rnea.py --gpu --batch 16777215     # ours on a GPU, and the plain definition
-    python kernels/benchmarks/rnea.py --gpu --mjx --batch 16777215             # and mjx.inverse at batch 1e6
+    python kernels/benchmarks/rnea.py --gpu --batch 16777215          # ours on a GPU, and the plain definition
+    python kernels/benchmarks/rnea.py --gpu --mjx --batch 16777215    # and mjx.inverse at batch 1e6
+    python kernels/benchmarks/rnea.py --gpu --warp --batch 16777215   # and mujoco_warp.inverse
 
 One process for each number of cores, bound to them before anything starts; warm-up first; contenders take
 turns, so that a busy machine is unfair to all of them; results are waited for, on a GPU those of eight calls
@@ -76,6 +77,8 @@ def build_peers(folder: Path, extra: list[str]) -> dict[str, str]:
     return reasons
 
 
+WORLDS = 8_192, 32_768, 131_072
+"""Of MuJoCo Warp, which is made for thousands of them: its best is to be told."""
 Contender = Callable[[], tuple[float, float]]
 """Runs once; nanoseconds an evaluation of wall time and of process time."""
 
@@ -247,6 +250,42 @@ def mjx(folder: Path, batch: int, note: Callable[[str, float], None]) -> dict[st
     return {name: timed(lambda: jax.block_until_ready(torque(*states)), batch)}
 
 
+def warp(folder: Path, note: Callable[[str, float], None]) -> dict[str, Contender]:
+    """MuJoCo Warp's inverse dynamics, its launches recorded once in a CUDA graph, as its documentation has it."""
+    import mujoco
+    import mujoco_warp
+    import numpy as np
+    import warp as wp
+
+    model = mujoco.MjModel.from_xml_path(str(folder / "panda.xml"))
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    known = mujoco.MjData(model)
+    known.qpos[:], known.qvel[:], known.qacc[:] = 0.3, 0.2, 0.1
+    mujoco.mj_inverse(model, known)
+    device, contenders = mujoco_warp.put_model(model), {}
+    for worlds in WORLDS:
+        states = mujoco_warp.make_data(model, nworld=worlds, nconmax=1, njmax=1)
+        for state in ("qpos", "qvel", "qacc"):
+            getattr(states, state).fill_(float(getattr(known, state)[0]))
+        start = time.perf_counter()
+        mujoco_warp.inverse(device, states)
+        wp.synchronize()
+        name = f"rnea, mujoco_warp.inverse of {worlds} worlds, float32"
+        note(name, time.perf_counter() - start)
+        torque = states.qfrc_inverse.numpy()
+        np.testing.assert_allclose(torque, np.tile(known.qfrc_inverse, (worlds, 1)), rtol=1e-3, atol=1e-3)
+        with wp.ScopedCapture() as recorded:
+            mujoco_warp.inverse(device, states)
+
+        def calls(states=states, graph=recorded.graph) -> None:
+            for _ in range(8):
+                wp.capture_launch(graph)
+            wp.synchronize()
+
+        contenders[name] = timed(calls, 8 * worlds)
+    return contenders
+
+
 def measure(cores: int, batch: int, rounds: int, folder: Path) -> dict:
     """All contenders on `cores` cores (0: a GPU); run in a process of its own."""
     if cores:
@@ -257,29 +296,17 @@ def measure(cores: int, batch: int, rounds: int, folder: Path) -> dict:
         compilation[name] = seconds
         print(f"{name}: first call {seconds:.1f} s", file=sys.stderr, flush=True)
 
+    if (folder / "warp").exists():
+        return rows_of(warp(folder, note), rounds, compilation)
     contenders = ours(batch, note, all_forms=cores != 1)
     if cores == 1:
         contenders |= pinocchio_loops(folder)
-    elif cores == 0 and (folder / "panda.xml").exists():
+    elif cores == 0 and (folder / "mjx").exists():
         contenders |= mjx(folder, 1_000_000, note)
     elif cores:
         contenders |= mujoco_threads(folder, cores)
         contenders |= mjx(folder, 32, note)
-    samples: dict[str, list] = {name: [] for name in contenders}
-    with undisturbed():
-        for _ in range(rounds):
-            for name, run in contenders.items():
-                samples[name].append(run())
-    rows = {
-        name: {
-            "wall_ns": statistics.median(w for w, _ in values),
-            "wall_ns_range": [min(w for w, _ in values), max(w for w, _ in values)],
-            "process_ns": statistics.median(p for _, p in values),
-            "process_ns_least": min(p for _, p in values),
-            "first_call_s": compilation.get(name),
-        }
-        for name, values in samples.items()
-    }
+    rows = rows_of(contenders, rounds, compilation)
     if cores == 0:
         from jaxpanda_kernels import batched, columns
 
@@ -295,8 +322,27 @@ def measure(cores: int, batch: int, rounds: int, folder: Path) -> dict:
     return rows
 
 
+def rows_of(contenders: dict[str, Contender], rounds: int, compilation: dict[str, float]) -> dict:
+    """Contenders in turn, some rounds of it."""
+    samples: dict[str, list] = {name: [] for name in contenders}
+    with undisturbed():
+        for _ in range(rounds):
+            for name, run in contenders.items():
+                samples[name].append(run())
+    return {
+        name: {
+            "wall_ns": statistics.median(w for w, _ in values),
+            "wall_ns_range": [min(w for w, _ in values), max(w for w, _ in values)],
+            "process_ns": statistics.median(p for _, p in values),
+            "process_ns_least": min(p for _, p in values),
+            "first_call_s": compilation.get(name),
+        }
+        for name, values in samples.items()
+    }
+
+
 def machine() -> dict:
-    names = ["jax", "jaxlib", "pin", "mujoco", "mujoco-mjx", "numpy"]
+    names = ["jax", "jaxlib", "pin", "mujoco", "mujoco-mjx", "mujoco-warp", "warp-lang", "numpy"]
     versions = {}
     for name in names:
         try:
@@ -341,6 +387,7 @@ RATIOS = [
     (2, "rnea, mjx.inverse vmapped over 32, float32", "rnea, columns, float32", 20),
     (0, "rnea, plain definition, float32", "rnea, columns, float32", 10),
     (0, "rnea, mjx.inverse vmapped over 1000000, float32", "rnea, columns, float32", 200),
+    *((0, f"rnea, mujoco_warp.inverse of {n} worlds, float32", "rnea, columns, float32", 10) for n in WORLDS),
 ]
 
 
@@ -352,6 +399,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--gpu", action="store_true", help="measure JAX's GPU in place of the processor")
     parser.add_argument("--mjx", action="store_true", help="on a GPU: mjx.inverse beside it, at batch 1e6")
+    parser.add_argument("--warp", action="store_true", help="on a GPU: mujoco_warp.inverse beside it")
     parser.add_argument(
         "--include", action="append", default=[], help="folder of further C++ headers (Eigen)"
     )
@@ -367,17 +415,24 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         reasons = {}
-        if args.mjx or not args.gpu:
-            from jaxpanda.arms.export import panda_mjcf
-
-            (folder / "panda.xml").write_text(panda_mjcf())
+        if args.mjx or args.warp or not args.gpu:
+            # in a process of its own, and on the processor: JAX keeps most of a card's memory
+            code = "from jaxpanda.arms.export import panda_mjcf; print(panda_mjcf())"
+            on_host = {**os.environ, "JAX_PLATFORMS": "cpu"}
+            with (folder / "panda.xml").open("w") as file:
+                subprocess.run([sys.executable, "-c", code], stdout=file, env=on_host, check=True)
+        if args.mjx:
+            (folder / "mjx").touch()
         if not args.gpu:
             reasons = build_peers(folder, args.include)
         for cores in [0] if args.gpu else [1, result["machine"]["cores"]]:
             command = [sys.executable, __file__, "--child", str(cores), name]
             command += ["--batch", str(args.batch), "--rounds", str(args.rounds)]
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-            rows = json.loads(done.stdout.splitlines()[-1])
+            child = functools.partial(subprocess.run, command, stdout=subprocess.PIPE, text=True, check=True)
+            rows = json.loads(child().stdout.splitlines()[-1])
+            if args.warp:  # when JAX has given the card's memory back
+                (folder / "warp").touch()
+                rows |= json.loads(child().stdout.splitlines()[-1])
             result["gpu" if cores == 0 else f"cores {cores}"] = rows
             show("on a GPU" if cores == 0 else f"on {cores} core(s)", rows)
             for of, peer, fast, target in RATIOS:
