@@ -8,6 +8,7 @@ import pytest
 from jaxpanda.diagnosis.alike import TEMPERATURE, shared
 from jaxpanda.effects.drive import Armature, JointSpring
 from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
+from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.effects.stribeck import StribeckFriction
 
@@ -50,9 +51,28 @@ def test_a_law_counts_with_the_parts_that_it_holds():
 
 
 def test_what_each_joint_has_of_its_own_is_not_shared():
-    for kind in (lambda j: JointSpring(j, "linear"), TorqueOffset):
+    for kind in (
+        lambda j: JointSpring(j, "linear"),
+        TorqueOffset,
+        lambda j: PreslidingHysteresis(j, 0.05, "dahl only"),
+    ):
         one, *others = (kind(j) for j in range(DOF))
         assert odds(one, others) == one.prior + one.form_prior
+
+
+def test_dry_friction_that_sticks_is_coulombs():
+    """Whatever its law builds up over: beside it, Coulomb's is as much likelier as beside itself."""
+    sticking = PreslidingHysteresis(3, 1e-3, "dahl only")
+    assert sticking.title == CoulombFriction.name
+    coulomb = CoulombFriction(1, 0.01)
+    assert odds(coulomb, [sticking]) == odds(coulomb, [CoulombFriction(3, 0.01)])
+
+
+def test_a_curve_is_shared_as_far_as_its_lines_are():
+    """What a curve adds must be borne out in each joint."""
+    curve = lambda j: StribeckFriction(j, 0.05, 0.01, 2.0, form="viscous")
+    others = [curve(j) for j in range(DOF - 1)]
+    assert odds(curve(DOF - 1), others) == StribeckFriction.prior
 
 
 def test_the_same_joint_twice_is_no_second_joint():

@@ -4,6 +4,10 @@ Gears and motors of an arm are mostly of one make: where a model lacks the frict
 others. So the share of joints that an effect is at is unknown, and the same for all: with a flat prior over it,
 one more than k of n joints has odds of k : n - k beforehand. The first has the odds of the effect's class. What a
 sensor is off by is its own.
+
+So are the curves of friction (Stribeck's, a power of the speed, load) over the lines that they hold: what lines
+leave of bristles and warm grease leans the same way in every joint, is no evidence of its own in each, and would
+add up to a curve that fits none of them.
 """
 
 from collections import defaultdict
@@ -20,18 +24,28 @@ quite what it is taken for, and counts as evidence what is none."""
 
 def shared(effects: Iterable[AbstractEffect], dof: int) -> float:
     """By how much likelier several effects are together, beforehand, than the odds of each by itself [nats]."""
-    paid: dict[str, dict[int, float]] = defaultdict(dict)
-    for effect in effects:
-        if isinstance(effect, AbstractJointEffect):
-            joint = effect.joints[0]
-            for name, prior in _laws(effect):
-                paid[name][joint] = min(prior, paid[name].get(joint, 0.0))
     gained = 0.0
-    for of_joints in paid.values():
+    for of_joints in _by_law(effects).values():
         for k, prior in enumerate(sorted(of_joints.values())[1:], 1):
             odds = TEMPERATURE * float(np.log(k / (dof - k)))
             gained += max(min(odds, 0.0) - prior, 0.0)
     return gained
+
+
+def joints_with(effects: Iterable[AbstractEffect]) -> frozenset[tuple[str, int]]:
+    """How many joints have each law that joints have alike: what the odds of one more depend on."""
+    return frozenset((law, len(joints)) for law, joints in _by_law(effects).items())
+
+
+def _by_law(effects: Iterable[AbstractEffect]) -> dict[str, dict[int, float]]:
+    """The prior of each law that joints have alike, at each joint that has it."""
+    out: dict[str, dict[int, float]] = defaultdict(dict)
+    for effect in effects:
+        if isinstance(effect, AbstractJointEffect):
+            joint = effect.joints[0]
+            for law, prior in _laws(effect):
+                out[law][joint] = min(prior, out[law].get(joint, 0.0))
+    return out
 
 
 def _laws(effect: AbstractEffect) -> list[tuple[str, float]]:

@@ -13,7 +13,7 @@ import scipy.special
 
 from ..arms.arm import Arm
 from ..effects import AbstractJointEffect
-from .alike import TEMPERATURE, shared
+from .alike import TEMPERATURE, joints_with, shared
 from .credible import fitted
 from .events import Proposal
 from .evidence import Design, Noise
@@ -253,7 +253,8 @@ def _told(found: Sequence[Choice]) -> Told:
 
 
 class Step:
-    """What tells one step of a search from another: its terms, and those that act in the same joints."""
+    """What tells one step of a search from another: its terms, those that act in the same joints, and how many
+    joints have what joints have alike."""
 
     def __init__(self, state: State, kind: str, which: Sequence[int]):
         share = state.shares
@@ -263,10 +264,12 @@ class Step:
             [state.terms[i] for i in which],
             [t for t, on in zip(state.terms, beside, strict=True) if on],
         )
+        elsewhere = [t.effect for t, on in zip(state.terms, beside, strict=True) if not on]
+        self.elsewhere = joints_with(elsewhere)
 
     def key(self, free: bool) -> tuple:
         """By the terms' identities."""
-        return self.kind, free, *(tuple(sorted(map(id, some))) for some in self.terms)
+        return self.kind, free, *(tuple(sorted(map(id, some))) for some in self.terms), self.elsewhere
 
     def tried(self, free: bool, barred: bool, found: Told = ()) -> dict[tuple, tuple["Step", Told]]:
         """For `Problem.tried`: the step, whose terms are kept lest their identities be used again, and what was

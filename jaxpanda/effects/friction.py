@@ -137,7 +137,6 @@ class PowerLawFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "power_law_friction"
     family: ClassVar[str] = "friction"
-    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "velocity"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("exponent", "1", 0.35, 3.0),)
     reveals: ClassVar[str] = ViscousFriction.reveals
@@ -306,7 +305,6 @@ class LoadDependentFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "load_dependent_friction"
     family: ClassVar[str] = "friction"
-    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "|load|, turned by direction"
     shapes: ClassVar[tuple[Shape, ...]] = (_WIDTH, Shape("exponent", "1", 0.6, 1.6))
     reveals: ClassVar[str] = "the same speed in loaded and unloaded poses; with and without payload"

@@ -39,7 +39,6 @@ class StribeckFriction(AbstractDryFriction):
 
     name: ClassVar[str] = "stribeck_friction"
     family: ClassVar[str] = "friction"
-    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "velocity"
     shapes: ClassVar[tuple[Shape, ...]] = (
         _VELOCITY,
@@ -131,7 +130,6 @@ class StribeckBristles(AbstractMemoryEffect):
 
     name: ClassVar[str] = StribeckFriction.name
     family: ClassVar[str] = "friction"
-    alike: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (_VELOCITY, Shape("breakaway_distance", "rad", 1e-4, 0.05))
     reveals: ClassVar[str] = StribeckFriction.reveals
     prior: ClassVar[float] = StribeckFriction.prior
