@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import excitation, result
 
-from jaxpanda import Arm, Corrected, Recording, replay
+from jaxpanda import Arm, Corrected, Recording, compare, draw_ensemble, replay
 from jaxpanda.__main__ import main
 from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.diagnosis import Diagnosis, TwoSided, diagnose, predict_sides
@@ -117,6 +117,21 @@ def test_the_corrected_arm_is_the_whole_one_as_its_motors_move_it(loaded):
         np.testing.assert_allclose(torque, later.tau_motor[i], atol=10 * NOISE)
 
 
+def test_an_ensemble_is_of_the_whole_arm(loaded):
+    """Load behind the drives, friction and rotors in them, each as far apart as it is off."""
+    members, corrected = draw_ensemble(loaded / "why", count=64, seed=0), Corrected.load(loaded / "why")
+    truths = {"coulomb_friction": COULOMB, "viscous_friction": VISCOUS, "armature": ROTORS}
+    columns = iter(members.effects.T)
+    for effect, coefficients in zip(corrected.effects, corrected.coefficients, strict=True):
+        first, *_ = [next(columns) for _ in coefficients]
+        if effect.name not in truths:
+            assert effect.family == "load"
+            assert abs(first.mean() - LOAD) < 0.02
+            continue
+        assert abs(first.mean() - truths[effect.name][effect.joints[0]]) < 5 * first.std() + 0.002
+        assert 0 < first.std() < 0.02
+
+
 def test_the_motors_move_the_arm_in_a_replay(loaded):
     later = load(loaded / "later.csv")
     replays = [replay(loaded / "why", one, seconds=3.0) for one in (later, later.of_link_side())]
@@ -168,6 +183,9 @@ def test_what_the_file_has_of_its_drives_is_known_of_them(tmp_path):
     assert motors is not None
     assert np.all(np.sqrt(np.mean((tau - later.tau) ** 2, 0)) < 1.2 * NOISE)
     assert np.all(np.sqrt(np.mean((motors - later.tau_motor) ** 2, 0)) < 0.2)
+    same = compare(tmp_path / "why", tmp_path / "why")
+    assert same.verdict == "agree"
+    assert {p.joint for p in same.parameters} >= set(range(1, 8))
 
 
 @pytest.mark.slow

@@ -1,8 +1,10 @@
 """What a diagnosis knows of links, friction and effects, for others to draw from."""
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg
 
 from ..feasible import Bounds
 from ..feasible.nearest import are_buildable
@@ -45,7 +47,7 @@ def posterior_of(found: "Diagnosis") -> Posterior:
         for k, column in enumerate(range(own.start, own.stop)):
             at.append(column)
             scale.append(1.0)
-            names.append(f"effect_{first + i + 1}_{k + 1}")
+            names.append(_effect(first + i, k))
             least.append(-np.inf)
     scale = np.array(scale)
     covariance = C[np.ix_(at, at)] * np.outer(scale, scale)
@@ -75,3 +77,41 @@ def posterior_of(found: "Diagnosis") -> Posterior:
         carried=carried if are_buildable(nominal - carried) else np.zeros_like(carried),
         noise=np.asarray(found.fit.rmse_after, float),
     )
+
+
+def posterior_of_sides(link: "Diagnosis", drive: "Diagnosis") -> Posterior:
+    """Of the whole arm as its motors move it (`two_sided.both`): links by the torque behind the drives, friction
+    of the model by that of the motors, effects by that of their side. Neither tells of the other's unknowns."""
+    links, drives = posterior_of(link), posterior_of(drive)
+    inertial = 10 * links.dof
+    shown = [e.acts_on != "torque" for e in link.corrected.effects]
+    behind = {_effect(i, k): _effect(sum(shown[:i]), k) for i, k in _coefficients(link) if shown[i]}
+    within = {_effect(i, k): _effect(sum(shown) + i, k) for i, k in _coefficients(drive)}
+    of_links = [i for i, name in enumerate(links.names) if name in behind]
+    # of the links rows that tell of what is left out are left out, of the drives those that tell of links
+    out = np.setdiff1d(np.arange(links.told.shape[1]), [*range(inertial), *(inertial + i for i in of_links)])
+    rows = [~links.told[:, out].any(1), drives.told[:, inertial:].any(1)]
+    columns = [[*range(inertial), *(inertial + i for i in of_links)], slice(inertial, None)]
+    each = [*zip((links, drives), rows, columns, strict=True)]
+    return dataclasses.replace(
+        links,
+        told=scipy.linalg.block_diag(*(one.told[on][:, at] for one, on, at in each)),
+        mean=np.concatenate([one.mean[on] for one, on, _ in each]),
+        covariance=scipy.linalg.block_diag(*(one.covariance[np.ix_(on, on)] for one, on, _ in each)),
+        names=(
+            *(behind[links.names[i]] for i in of_links),
+            *(within.get(name, name) for name in drives.names),
+        ),
+        least=np.concatenate([links.least[of_links], drives.least]),
+        noise=drives.noise,
+    )
+
+
+def _coefficients(found: "Diagnosis") -> list[tuple[int, int]]:
+    """Effect and coefficient of each that is fitted."""
+    return [(i, k) for i, c in enumerate(found.corrected.coefficients) for k in range(len(c))]
+
+
+def _effect(i: int, k: int) -> str:
+    """Name of a coefficient of an effect, both from 0."""
+    return f"effect_{i + 1}_{k + 1}"

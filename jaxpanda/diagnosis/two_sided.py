@@ -21,17 +21,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .. import files
 from ..arms import markup
 from ..arms.arm import Arm
 from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
-from ..corrected import Corrected
+from ..corrected import KIND, Corrected
 from ..effects import AbstractEffect
+from ..posterior import FILE as POSTERIOR_FILE
 from ..recordings import Recording
 from . import saved
 from .as_recorded import at_rows
 from .diagnosis import Diagnosis
 from .finding import VERDICTS, Finding, Fit
+from .posterior import posterior_of_sides
 
 BEHIND = frozenset({"load", "contact"})
 """Families of what acts on the links, behind every drive."""
@@ -116,8 +119,8 @@ class TwoSided:
         return [VERDICTS[self.verdict], *told]
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
-        """Write diagnosis.json, corrected.xml with what it includes, and corrected.json, which has both sides
-        beside the whole arm. What corrected.xml will not find there comes back, a sentence each.
+        """Write diagnosis.json, corrected.xml with what it includes, corrected.json, which has both sides beside
+        the whole arm, and posterior.npz. What corrected.xml will not find there comes back, a sentence each.
 
         Raises:
             InputError: a file of such a name stands there that no earlier diagnosis left; nothing is written.
@@ -127,7 +130,9 @@ class TwoSided:
             for side, found in (("link", self.link), ("drive", self.drive))
         }
         whole = {**saved.with_noise(self.corrected, self.drive.fit), "sides": sides}
-        saved.write(self, folder, whole)
+        with files.output_folder(folder, KIND) as scratch:
+            saved.write(self, scratch, whole)
+            posterior_of_sides(self.link, self.drive).save(scratch / POSTERIOR_FILE)
         return missing_assets(self.written, Path(folder))
 
 
