@@ -232,19 +232,24 @@ def test_samples_of_which_laws_tell_less_are_worth_what_they_are_likely_in_their
     assert score["all"] > score["wrong"] + 100
 
 
-def test_what_a_rest_holds_is_one_number_however_many_samples_it_lasts():
-    """Against the density of noise about a level that nobody knows; as one of each sample it cost 460 nats."""
+@pytest.mark.parametrize(("unresolved", "quiet"), [(0.0, 1.0), (1.0, 1.0), (0.5, 0.3)])
+def test_what_a_rest_holds_is_one_number_however_many_samples_it_lasts(unresolved, quiet):
+    """Against the density of noise about a level that nobody knows; as one of each sample it cost 460 nats.
+
+    Noise may be less than at other times, and less than what laws may be off from sample to sample.
+    """
     count, variance = 200, 100.0
-    x = np.random.default_rng(2).normal(size=count)
+    x = np.sqrt(quiet) * np.random.default_rng(2).normal(size=count)
     stays = np.full((count, 1), variance)
-    trust = 1 / np.sqrt(1 + stays)
-    noise = Noise(np.zeros((1, 3)), np.ones(1), np.ones(1), trust, stays)
+    trust = 1 / np.sqrt(1 + unresolved + stays)
+    noise = Noise(np.zeros((1, 3)), np.ones(1), np.ones(1), trust, stays, quiet=np.array([quiet]))
     score = State((), noise, Design([np.zeros((count, 0))], [x * trust[:, 0]], np.zeros(0))).score
-    wide = np.eye(count) + variance
+    wide = (1 + unresolved) * np.eye(count) + variance
     exact = -0.5 * (x @ np.linalg.solve(wide, x) + np.linalg.slogdet(wide)[1])
     assert score == pytest.approx(exact, abs=10)
     of_each = dataclasses.replace(noise, at_rest=None)
-    assert of_each.widened(0, np.ones(count, bool)) == pytest.approx(0.5 * count * np.log(1 + variance))
+    apart = 0.5 * count * np.log(1 + unresolved + variance)
+    assert of_each.widened(0, np.ones(count, bool)) == pytest.approx(apart)
 
 
 def test_each_rest_has_a_number_of_its_own():

@@ -104,7 +104,7 @@ def at_rest(
     """Square of what a law may be off for as long as a joint rests [N² m²]: dry friction, by all of it."""
     if not (effect.dry and isinstance(effect, AbstractJointEffect)):
         return None
-    j, rests = effect.joints[0], _resting(traces)
+    j, rests = effect.joints[0], resting(traces)
     off = np.zeros_like(rests)
     off[:, j] = np.square(_level(np.concatenate(torque)[:, j]) * rests[:, j])
     return off
@@ -112,10 +112,10 @@ def at_rest(
 
 def known_at_rest(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
     """The same of the friction that the user's model holds."""
-    return np.square(np.asarray(traces[0].motion.arm.frictionloss) * _resting(traces))
+    return np.square(np.asarray(traces[0].motion.arm.frictionloss) * resting(traces))
 
 
-def _resting(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
+def resting(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:
     """`Trace.unsure` of all recordings, one below the other."""
     return np.concatenate([np.zeros(t.motion.q.shape) if t.unsure is None else t.unsure for t in traces])
 

@@ -51,6 +51,8 @@ class Noise:
     slow: Float[np.ndarray, "dof 2"] | None = None
     """Pole p and zero z of a slow error beside the noise: what is white is $(1 - p L) / (1 - z L)$ of the
     innovations, with L the step back; as good as none where they are equal."""
+    quiet: Float[np.ndarray, " dof"] | None = None
+    """Mean square of the innovations while a joint rests, over that of all; as of any where None."""
     least: Float[np.ndarray, " dof"] | None = None
     """Deviation of the innovations where nothing is left unexplained; `sigma` may be larger [N m]."""
 
@@ -149,7 +151,7 @@ class Noise:
 
         Of errors from sample to sample of variance $i_t$, in the noise's, it is $\tfrac12 \sum \log(1 + i_t)$. An
         error of variance $\rho$ that stays for a rest is one number: $\tfrac12 \log(1 + \sum \rho_t / (1 + i_t))$
-        for each, and the samples scatter about it as they would without.
+        for each, and the samples scatter about it as noise does while the joint rests.
         """
         if self.trust is None:
             return 0.0
@@ -159,7 +161,8 @@ class Noise:
         )
         own = spread - stays
         rests = np.array([np.sum((stays / own)[rows]) for rows in stretches(stays > 0)])
-        each = np.log(own[counts]) + (stays / spread)[counts]
+        scatter = 1.0 if self.quiet is None else self.quiet[joint]
+        each = np.log(own[counts]) + scatter * (stays / (spread * own))[counts]
         return 0.5 * float(np.sum(each) + np.sum(np.log1p(rests)))
 
     def has_slow(self, joint: int) -> bool:

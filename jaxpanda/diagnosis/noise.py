@@ -123,9 +123,13 @@ class Saturation:
         return r - V @ (V.T @ r), [U, V]
 
     def noise(
-        self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]]
-    ) -> tuple[np.ndarray, float, float]:
-        r"""`autoregression` of what the model with `extra` columns leaves, with what it took of noise put back.
+        self,
+        joint: int,
+        extra: Sequence[Float[np.ndarray, "_time _n"]],
+        rests: Float[np.ndarray, " _rows"],
+    ) -> tuple[np.ndarray, float, float, float]:
+        r"""`autoregression` of what the model with `extra` columns leaves, with what it took of noise put back;
+        and the mean square of the innovations in `rests`, over that of all: an arm at rest is mostly quieter.
 
         Of white noise of variance $\sigma^2$ a model with orthonormal columns U takes
         $\sigma^2 \sum_t U_{t-k} \cdot U_{t-l}$ of the moment of lags k and l: most where it is slow.
@@ -135,7 +139,12 @@ class Saturation:
         taken = sum((self.moments(V) for V in bases[1:]), basis.taken)
         count, used = basis.count, sum(U.shape[1] for U in bases)
         variance = float(r @ r) / max(count - used, LEAST_FREE * count)
-        return autoregression(self.moments(r[:, None]) + variance * taken, count)
+        a, sigma, std = autoregression(self.moments(r[:, None]) + variance * taken, count)
+        b = np.concatenate([[1.0], -a])
+        left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)]) / sigma
+        free = rests * (1 - sum(np.sum(U**2, 1) for U in bases))
+        quiet = (rests @ left**2 + FEWEST_FREE) / (np.sum(free) + FEWEST_FREE)
+        return a, sigma, std, float(quiet)
 
     def tells(self, joint: int) -> bool:
         """Whether the recordings are long enough for the model to leave noise of a joint to be seen."""

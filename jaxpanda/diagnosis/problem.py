@@ -17,7 +17,7 @@ from ..arms.arm import Arm
 from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect, Channels, Stretches, joint_columns
 from ..errors import InputError
 from .bodies import Body, body
-from .discrepancy import at_rest, known_at_rest, of_law, unresolved, unresolved_known
+from .discrepancy import at_rest, known_at_rest, of_law, resting, unresolved, unresolved_known
 from .evidence import Columns, Design, Noise
 from .grid import Grid
 from .host import parallel
@@ -489,7 +489,7 @@ class Problem:
             if joint not in heard:
                 taus = [t.signals.tau for t in self.traces if t.signals.tau is not None]
                 quiet = float(np.median([signals_.white_noise(tau)[joint] for tau in taus]))
-                return np.zeros(ORDER), _UNHEARD, max(quiet, QUIETEST)
+                return np.zeros(ORDER), _UNHEARD, max(quiet, QUIETEST), 1.0
             here = [t for t in (*self.background, *terms) if t.acts[joint]]
             key = joint, *(id(t) for t in here)
             if key not in self._noises:
@@ -497,8 +497,9 @@ class Problem:
                     np.concatenate([ripples[joint][r], *(t.columns[r][:, joint] for t in here)], 1)
                     for r in range(len(self.traces))
                 ]
-                self._noises[key] = (*self.saturation.noise(joint, extra), here)  # keeps what it names alive
-            return self._noises[key][:3]
+                found = self.saturation.noise(joint, extra, self._resting_rows[:, joint])
+                self._noises[key] = (*found, here)  # keeps what it names alive
+            return self._noises[key][:4]
 
         ripples = self.saturation.ripples  # made once, before there are threads
         heard = {j for j in range(self.dof) if self.saturation.tells(j)}
@@ -511,12 +512,18 @@ class Problem:
                 " physics from noise; record longer, or more motion: of seven joints that move all the time"
                 " 2 s at 100 Hz or more are enough"
             )
-        a, sigma, std = zip(*parallel(one, range(self.dof)), strict=True)
+        a, sigma, std, quiet = zip(*parallel(one, range(self.dof)), strict=True)
         off = self._known_unresolved + sum(t.unresolved for t in terms if t.unresolved is not None)
         rests = np.zeros_like(off) + sum(t.at_rest for t in terms if t.at_rest is not None)
         off, rests, known = (x / np.square(std) for x in (off, rests, self._known_at_rest))
         trust = 1 / np.sqrt(1 + off + rests)
-        return Noise(np.stack(a), np.array(sigma), np.array(std), trust, rests, rests + known)
+        return Noise(
+            np.stack(a), np.array(sigma), np.array(std), trust, rests, rests + known, quiet=np.array(quiet)
+        )
+
+    @functools.cached_property
+    def _resting_rows(self) -> Float[np.ndarray, "rows dof"]:
+        return resting(self.traces)
 
     @functools.cached_property
     def _known_at_rest(self) -> Float[np.ndarray, "rows dof"]:
