@@ -16,6 +16,7 @@ from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.resting import AtRest, judge
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
+from jaxpanda.errors import InputError
 from jaxpanda.recordings import save
 
 LOSS = 0.4
@@ -138,6 +139,30 @@ def test_what_healthy_recordings_of_the_same_pose_show_is_not_told(rubbing):
     assert judged(rubbing, rest(20, biased)).findings
     healthy = rest(21, biased, pose=20)
     assert not judged(rubbing, rest(20, biased), reference=[healthy]).findings
+
+
+def sets_out(seed: int, seconds: float) -> Recording:
+    """An arm at rest, which sets out 0.3 s before the recording ends; what accelerates it is in the torque."""
+    still = rest(seed)
+    rows = slice(0, round(seconds * RATE))
+    t = still.time[rows]
+    ahead = np.maximum(t - (t[-1] - 0.3), 0)[:, None] * (np.arange(7) == 0)
+    return Recording(still.name, t, still.q[rows] + 5 * ahead**2, tau=still.tau[rows] + 12 * (ahead > 0))
+
+
+def test_an_arm_that_sets_out_at_the_end_is_judged_while_it_rests(rubbing):
+    """What accelerates it was told as a drift of sensors, at 1.00."""
+    found = diagnose(rubbing, [sets_out(31, SECONDS)])
+    assert isinstance(found, AtRest)
+    assert (found.verdict, found.findings) == ("consistent", ())
+    assert any("judged where the arm holds still, 0.00 to 7.7" in note for note in found.notes)
+
+
+def test_too_little_rest_beside_a_motion_that_filters_cut_off_is_refused(rubbing):
+    with pytest.raises(
+        InputError, match=r"rest_32.csv: the arm moves only within 0.4 s of an end.*0.80 s beside"
+    ):
+        diagnose(rubbing, [sets_out(32, 1.05)])
 
 
 def test_a_torque_that_never_changes_says_nothing_at_rest(rubbing):

@@ -24,7 +24,7 @@ from .as_recorded import at_rows, predicted
 from .diagnosis import Diagnosis, sought
 from .host import on_host
 from .meaning import Misread, misread
-from .resting import AtRest, judge, rests
+from .resting import AtRest, judge, rests, while_still
 from .traces import Trace, prepare, work_rate
 from .two_sided import TwoSided, both, drive_alone, links_alone, notes_of, on_drives, on_motors, passed_on
 from .written import file_with
@@ -78,7 +78,7 @@ def diagnose(
         recording.require_tau()
     two = all(one.tau_motor is not None for one in loaded)
     if not two:
-        loaded = [_without_motors(one) for one in loaded]
+        loaded = [_without_motors(one, "not all recordings have it") for one in loaded]
     link_arm = links_alone(arm) if two else arm
     coarse, traces = work_rate(loaded), []
     for recording in loaded:
@@ -86,6 +86,9 @@ def diagnose(
         progress(_read(traces[-1]))
     suspect = [trace for trace, on in zip(traces, active, strict=True) if on]
     if all(rests(trace) for trace in suspect):
+        held = [_without_motors(one, "no joint moves") for one, on in zip(loaded, active, strict=True) if on]
+        still = [while_still(one, trace) for one, trace in zip(held, suspect, strict=True)]
+        suspect = [prepare(one, link_arm, coarse=coarse) for one in still]
         healthy = [trace for trace, on in zip(traces, active, strict=True) if not on]
         return _as_it_is(judge(suspect, healthy, source, knowledge), arm)
     for recording in loaded:
@@ -117,11 +120,11 @@ def _as_it_is(found: Found, arm: Arm) -> Found:
     return dataclasses.replace(found, corrected=dataclasses.replace(found.corrected, arm=arm))
 
 
-def _without_motors(recording: Recording) -> Recording:
-    """The torque of the motors left out, as other recordings have none; and said so."""
+def _without_motors(recording: Recording, why: str) -> Recording:
+    """The torque of the motors left out, and said so."""
     if recording.tau_motor is None:
         return recording
-    note = f"{recording.name}: tau_motor is not used, as not all recordings have it"
+    note = f"{recording.name}: tau_motor is not used, as {why}"
     return dataclasses.replace(recording.of_link_side(), notes=(*recording.notes, note))
 
 

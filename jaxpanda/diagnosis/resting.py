@@ -37,14 +37,18 @@ from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
 from ..effects import Motion
+from ..errors import InputError
+from ..recordings import Recording
 from ..report import Figure, Section, Table, number
 from . import saved
 from .finding import Finding, Fit
 from .knowledge import Knowledge, inertial_spread
-from .traces import Trace
+from .traces import TRIM, Trace
 
 YIELDS = 0.02
 """Travel below which an arm holds still [rad]: what gives way by milliradians under a force does not move."""
+LEAST = 3 * TRIM
+"""Rest that is left to be judged, at least [s]."""
 _BLOCK, _BLOCKS = 0.1, 240
 """Torque is averaged over so long [s], or longer where there would be more blocks than so many."""
 _FEWEST = 8
@@ -191,6 +195,33 @@ class AtRest:
 def rests(trace: Trace) -> bool:
     """Whether the arm holds still in a recording."""
     return bool(np.all(np.ptp(trace.motion.q, axis=0) < YIELDS))
+
+
+def while_still(recording: Recording, trace: Trace) -> Recording:
+    """The rows of a recording in which an arm that rests in its trace holds still, without those at its ends in
+    which it sets out or comes to rest, which filters had cut off.
+
+    Raises:
+        InputError: too few are left.
+    """
+    travel = np.abs(recording.q - trace.motion.q.mean(0)).max(1)
+    moves = np.flatnonzero(travel > YIELDS)
+    middle = np.searchsorted(recording.time, trace.motion.time.mean())
+    start, stop = (moves[moves < middle][-1:] + 1, moves[moves >= middle][:1])
+    kept = slice(int(start[0]) if len(start) else 0, int(stop[0]) if len(stop) else recording.samples)
+    if kept == slice(0, recording.samples):
+        return recording
+    still = recording.at(kept)
+    seconds = float(np.ptp(still.time))
+    if seconds < LEAST:
+        raise InputError(
+            f"{recording.name}: the arm moves only within {TRIM:g} s of an end, where filters tell no torque, and"
+            f" holds still for {seconds:.2f} s beside; record the whole motion, or {LEAST:g} s of rest or more"
+        )
+    note = (
+        f"{recording.name}: judged where the arm holds still, {still.time[0]:.2f} to {still.time[-1]:.2f} s"
+    )
+    return dataclasses.replace(still, notes=(*recording.notes, note))
 
 
 def judge(
