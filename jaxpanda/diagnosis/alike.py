@@ -5,9 +5,10 @@ others. So the share of joints that an effect is at is unknown, and the same for
 one more than k of n joints has odds of k : n - k beforehand. The first has the odds of the effect's class. What a
 sensor is off by is its own.
 
-So are the curves of friction (Stribeck's, a power of the speed, load) over the lines that they hold: what lines
-leave of bristles and warm grease leans the same way in every joint, is no evidence of its own in each, and would
-add up to a curve that fits none of them.
+The curves of friction over speed and load (Stribeck's, a power, the load itself) are each joint's, beside the
+lines that they hold: what lines leave of bristles and warm grease leans the same way in every joint, is no
+evidence of its own in each, and would add up to a curve that fits none of them. Bristles are what they are, and
+shared.
 """
 
 from collections import defaultdict

@@ -45,6 +45,7 @@ class PreslidingHysteresis(AbstractMemoryEffect):
 
     name: ClassVar[str] = "presliding_hysteresis"
     family: ClassVar[str] = "friction"
+    alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "reversal, turned by direction"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("breakaway_distance", "rad", 1e-4, 0.2),)
     reveals: ClassVar[str] = "slow reversals of half to five breakaway distances"
@@ -93,11 +94,6 @@ class PreslidingHysteresis(AbstractMemoryEffect):
     def title(self) -> str:
         """Of a joint whose model has the level already, memory is all that it adds."""
         return CoulombFriction.name if self.sticks and self._extent != "extra" else self.name
-
-    @property
-    def alike(self) -> bool:
-        """What is Coulomb's friction is of all gears."""
-        return self.title == CoulombFriction.name
 
     @property
     def form_prior(self) -> float:
