@@ -148,9 +148,13 @@ def _wider(premises: Premises, state: State) -> tuple[Premises, tuple[Term, ...]
             best, terms, likeliest = other, needed.terms, needed.score + price
     if best is None:
         return None
-    told = f"{best.knowledge!r}" + (f", {best.scale:g} times" if best.scale != 1 else "")
+    told = f"{best.knowledge!r}"
+    told += f", with deviations {best.scale:g} times as large" if best.scale != 1 else ""
     note = f"the recordings contradict that the model's numbers are known as {premises.knowledge!r}"
-    return dataclasses.replace(best, notes=(*premises.notes, f"{note}: they were taken as {told}")), terms
+    others = (
+        one for one in premises.notes if not one.startswith(note)
+    )  # of a step before, which went less far
+    return dataclasses.replace(best, notes=(*others, f"{note}: they were taken as {told}")), terms
 
 
 def _needed(problem: Problem, state: State) -> State:

@@ -488,8 +488,8 @@ class Problem:
         def one(joint: int) -> tuple:
             if joint not in heard:
                 taus = [t.signals.tau for t in self.traces if t.signals.tau is not None]
-                quiet = float(np.median([signals_.white_noise(tau)[joint] for tau in taus]))
-                return np.zeros(ORDER), _UNHEARD, max(quiet, QUIETEST), 1.0
+                white = float(np.median([signals_.white_noise(tau)[joint] for tau in taus]))
+                return np.zeros(ORDER), _UNHEARD, max(white, QUIETEST), 1.0
             here = [t for t in (*self.background, *terms) if t.acts[joint]]
             key = joint, *(id(t) for t in here)
             if key not in self._noises:
@@ -497,11 +497,11 @@ class Problem:
                     np.concatenate([ripples[joint][r], *(t.columns[r][:, joint] for t in here)], 1)
                     for r in range(len(self.traces))
                 ]
-                found = self.saturation.noise(joint, extra, self._resting_rows[:, joint])
+                found = self.saturation.noise(joint, extra, rows_at_rest[:, joint])
                 self._noises[key] = (*found, here)  # keeps what it names alive
             return self._noises[key][:4]
 
-        ripples = self.saturation.ripples  # made once, before there are threads
+        ripples, rows_at_rest = self.saturation.ripples, self._at_rest  # made once, before there are threads
         heard = {j for j in range(self.dof) if self.saturation.tells(j)}
         if not heard:
             samples = max(self.saturation.samples(j) for j in range(self.dof))
@@ -522,7 +522,7 @@ class Problem:
         )
 
     @functools.cached_property
-    def _resting_rows(self) -> Float[np.ndarray, "rows dof"]:
+    def _at_rest(self) -> Float[np.ndarray, "rows dof"]:
         return resting(self.traces)
 
     @functools.cached_property
