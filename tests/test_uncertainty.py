@@ -10,7 +10,7 @@ from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.shapes import first_steps, refine, score
 from jaxpanda.diagnosis.state import places, start, with_terms
 from jaxpanda.diagnosis.traces import prepare
-from jaxpanda.diagnosis.uncertainty import covariances, polished
+from jaxpanda.diagnosis.uncertainty import covariances, leaning, polished
 from jaxpanda.effects import AbstractEffect, Motion
 from jaxpanda.effects.drive import TorqueRipple
 from jaxpanda.effects.memory import PreslidingHysteresis
@@ -107,3 +107,37 @@ def test_the_interval_of_a_parameter_holds_the_truth_as_often_as_it_says(law, ef
         off = np.array([np.log(d[name][0] / true) * d[name][0] / d[name][1] for d in draws])
         assert np.sum(np.abs(off) > 1.96) <= 4, (name, off)
         assert off.std() > 0.4, (name, off)  # much too wide would be no better
+
+
+def test_an_interval_allows_for_what_nobody_modelled_that_goes_along_with_the_law():
+    """Torque of the same few motions as the law's, fitted by it in part: an interval by white noise misses it."""
+    rng, t, noise = np.random.default_rng(0), np.arange(0, 20, 0.02), 0.05
+    motion = lambda: sum(
+        rng.normal() * np.sin(0.1 * k * 2 * np.pi * t) + rng.normal() * np.cos(0.1 * k * 2 * np.pi * t)
+        for k in (1, 2, 3)
+    )
+    plain, wider = [], []
+    for _ in range(400):
+        law, other = motion(), rng.uniform(0, 0.5) * motion()
+        tau = law + other + noise * rng.normal(size=len(t))  # of one N m a unit of the law
+        held = np.zeros_like(tau)
+        for block in np.array_split(np.arange(len(t)), 5):
+            rest = np.setdiff1d(np.arange(len(t)), block)
+            held[block] = tau[block] - law[block] * (law[rest] @ tau[rest]) / (law[rest] @ law[rest])
+        found = (law @ tau) / (law @ law)
+        std = noise / np.sqrt(law @ law)
+        missed = np.sqrt(max(np.mean(held**2) - noise**2, 0.0))
+        size = np.sqrt(np.mean(law**2))
+        share = leaning(np.array([abs(found) * size]), np.array([missed]), np.array([noise]))
+        plain.append(abs(found - 1) < 1.96 * std)
+        wider.append(abs(found - 1) < 1.96 * np.hypot(std, share * found))
+    assert np.mean(plain) < 0.3
+    assert 0.9 < np.mean(wider) < 0.99
+
+
+def test_where_nothing_is_missing_an_interval_is_as_it_was():
+    law, noise = np.array([0.0, 2.0, 0.5]), np.full(3, 0.1)
+    assert leaning(law, np.zeros(3), noise) == 0.0
+    assert leaning(np.zeros(3), np.ones(3), noise) == 0.0
+    one = leaning(np.array([0.0, 2.0, 0.0]), np.array([9.0, 0.2, 0.0]), noise)
+    assert one == pytest.approx(0.5 * 0.2 / 2.0)

@@ -17,7 +17,7 @@ from .finding import Finding, joined
 from .problem import Problem, Term
 from .search import posterior
 from .state import State, foretelling, leftover, places, without
-from .uncertainty import covariances
+from .uncertainty import covariances, leaning
 from .unnamed import hum, standing_off, stuck
 
 LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05
@@ -38,7 +38,12 @@ REFITTED = 0.9
 
 
 def findings(
-    problem: Problem, searched: State, state: State, laws: State, lost: Sequence[bool]
+    problem: Problem,
+    searched: State,
+    state: State,
+    laws: State,
+    lost: Sequence[bool],
+    missed: Float[np.ndarray, " dof"] | float = 0.0,
 ) -> list[Finding]:
     """The accepted terms as findings, those first that explain most torque, in the noise of its joint.
 
@@ -48,12 +53,16 @@ def findings(
         state: the same with its shapes polished.
         laws: the same without discrepancy, as the corrected model has them: what is told of torque and numbers.
         lost: which of its terms predict torque no better where they were not fitted.
+        missed: torque that the corrected model lacks [N m]; each law may have taken in some of it.
     """
     rivals = [_rivals(problem, searched, state, i) for i in range(len(state.terms))]
     groups = together(problem, state.terms)
     names = titles(state.terms)
     doubt = np.where(lost, MISLEADS, 1.0)
-    spread = covariances(problem, state)
+    spread = [
+        _beside(problem, laws, i, covariance, missed + np.zeros(problem.dof))
+        for i, covariance in enumerate(covariances(problem, state))
+    ]
     helps = foretold(problem, laws, groups)
     out = [
         _finding(problem, laws, group, names[group[0]], rivals, doubt, spread, gained)
@@ -189,6 +198,22 @@ def torque(state: State, *members: int) -> list[Float[np.ndarray, "_time dof"]]:
     """Torque of terms together in each recording [N m]."""
     parts = [[columns @ coefficients(state, i) for columns in state.terms[i].columns] for i in members]
     return [np.sum(of_one, 0) for of_one in zip(*parts, strict=True)]
+
+
+def _beside(
+    problem: Problem,
+    state: State,
+    i: int,
+    covariance: Float[np.ndarray, "n n"],
+    missed: Float[np.ndarray, " dof"],
+) -> Float[np.ndarray, "n n"]:
+    """Covariance of a term's numbers, what its coefficients may be off by for torque that is lacking with it."""
+    c = coefficients(state, i)
+    law = np.concatenate(torque(state, i))
+    rms = np.sqrt(np.mean(law[np.any(law != 0, axis=1)] ** 2, 0)) if np.any(law) else np.zeros(problem.dof)
+    off = np.zeros(len(covariance))
+    off[: len(c)] = leaning(rms, missed, state.noise.std) * c
+    return covariance + np.diag(off**2)
 
 
 def _finding(

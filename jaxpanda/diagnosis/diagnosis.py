@@ -199,7 +199,8 @@ def sought(
         kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
         corrected = correct(kept)
     lost = [all(t is not k for k in kept.terms) for t in laws.terms]
-    found, fitted = [*findings(problem, searched, state, laws, lost), *wrong], fit(problem, kept)
+    fitted = fit(problem, kept)
+    found = [*findings(problem, searched, state, laws, lost, fitted.missed), *wrong]
     more = partly(problem, state) or not all(_judged(problem))
     answer = verdict(found, fitted, more)
     told, notes = calibrated(found, answer, fitted), list(premises.notes)

@@ -89,6 +89,11 @@ class Fit:
     held_out_rmse_after: Float[np.ndarray, " dof"]
     noise_floor: Float[np.ndarray, " dof"]
 
+    @property
+    def missed(self) -> Float[np.ndarray, " dof"]:
+        """Of the torque that nothing was fitted to, what the model lacks beyond the noise, rms [N m]."""
+        return np.sqrt(np.maximum(self.held_out_rmse_after**2 - self.noise_floor**2, 0.0))
+
     def to_json(self) -> dict[str, list[float]]:
         return {f.name: [float(v) for v in getattr(self, f.name)] for f in dataclasses.fields(self)}
 

@@ -11,7 +11,9 @@ terms have one covariance, beside what a refit of the model may absorb. Two are 
   needs no model of the noise and allows for a wrong one of the arm, but cannot see what happened in one stretch
   only. `jaxpanda.identification.statistics` has its formula and source.
 
-Each parameter takes the larger deviation of the two; correlations are the first one's.
+Each parameter takes the larger deviation of the two; correlations are the first one's. Neither sees torque that
+nobody modelled and that goes along with a law's all the time: the law has taken it in. To the coefficients comes
+what it may be (`leaning`).
 """
 
 import dataclasses
@@ -32,6 +34,11 @@ _STEP_LOG, _STEP_SHARE, _STEP_TIME = 0.02, 0.002, 0.01
 """Steps of the differences: of a logarithm, as a share of the bounds, and of an instant [s]."""
 _POLISHED, _ENOUGH = 5, 0.01
 """Steps towards the optimum at most, and the evidence below which another is not worth it [nats]."""
+
+
+LEANS = 0.5
+"""Correlation that torque which a model lacks may have with that of a law, one standard deviation: as directions
+in a space of four dimensions have. Both follow the same few motions."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,6 +137,24 @@ def covariances(problem: Problem, state: State) -> list[Float[np.ndarray, "n n"]
         scale = np.array([1.0] * len(c) + unit)
         out.append(scale[:, None] * C[np.ix_(at, at)] * scale)
     return out
+
+
+def leaning(
+    law: Float[np.ndarray, " dof"], missed: Float[np.ndarray, " dof"], noise: Float[np.ndarray, " dof"]
+) -> float:
+    r"""Share of itself that a law may be off by, for what the model lacks beside it, one standard deviation.
+
+    Least squares put $\rho\,e_j/\tau_j$ of it into the law at a joint where it has rms torque $\tau_j$ and
+    $e_j$ is lacking, with $\rho$ their unknown correlation; joints weigh as their noise has it.
+
+    Args:
+        law: rms torque of the law [N m].
+        missed: of what is lacking [N m].
+        noise: [N m].
+    """
+    weight = np.square(law / noise)
+    off = np.sqrt(np.sum(np.square(law * missed / noise**2)))
+    return LEANS * float(off / np.sum(weight)) if np.any(weight) else 0.0
 
 
 def _tangent(
