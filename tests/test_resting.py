@@ -158,6 +158,15 @@ def test_an_arm_that_sets_out_at_the_end_is_judged_while_it_rests(rubbing):
     assert any("judged where the arm holds still, 0.00 to 7.7" in note for note in found.notes)
 
 
+def test_one_wrong_sample_of_position_does_not_end_a_rest(rubbing):
+    still = rest(33)
+    q = still.q.copy()
+    q[400, 2] += 0.05
+    found = diagnose(rubbing, [dataclasses.replace(still, q=q)])
+    assert found.verdict == "consistent"
+    assert not any("judged where" in note for note in found.notes)
+
+
 def test_too_little_rest_beside_a_motion_that_filters_cut_off_is_refused(rubbing):
     with pytest.raises(
         InputError, match=r"rest_32.csv: the arm moves only within 0.4 s of an end.*0.80 s beside"

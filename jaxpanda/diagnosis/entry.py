@@ -86,9 +86,8 @@ def diagnose(
         progress(_read(traces[-1]))
     suspect = [trace for trace, on in zip(traces, active, strict=True) if on]
     if all(rests(trace) for trace in suspect):
-        held = [_without_motors(one, "no joint moves") for one, on in zip(loaded, active, strict=True) if on]
-        still = [while_still(one, trace) for one, trace in zip(held, suspect, strict=True)]
-        suspect = [prepare(one, link_arm, coarse=coarse) for one in still]
+        given = [one for one, on in zip(loaded, active, strict=True) if on]
+        suspect = [_at_rest(one, trace, coarse) for one, trace in zip(given, suspect, strict=True)]
         healthy = [trace for trace, on in zip(traces, active, strict=True) if not on]
         return _as_it_is(judge(suspect, healthy, source, knowledge), arm)
     for recording in loaded:
@@ -118,6 +117,12 @@ def diagnose(
 def _as_it_is(found: Found, arm: Arm) -> Found:
     """With the user's arm, drives and all, where it was compared without them."""
     return dataclasses.replace(found, corrected=dataclasses.replace(found.corrected, arm=arm))
+
+
+def _at_rest(recording: Recording, trace: Trace, coarse: float) -> Trace:
+    """The trace of a recording in which no joint moves, where none does."""
+    still = while_still(_without_motors(recording, "no joint moves"), trace)
+    return trace if still is recording else prepare(still, trace.motion.arm, coarse=coarse)
 
 
 def _without_motors(recording: Recording, why: str) -> Recording:

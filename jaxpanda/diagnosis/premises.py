@@ -151,9 +151,8 @@ def _wider(premises: Premises, state: State) -> tuple[Premises, tuple[Term, ...]
     told = f"{best.knowledge!r}"
     told += f", with deviations {best.scale:g} times as large" if best.scale != 1 else ""
     note = f"the recordings contradict that the model's numbers are known as {premises.knowledge!r}"
-    others = (
-        one for one in premises.notes if not one.startswith(note)
-    )  # of a step before, which went less far
+    # in the place of a step before, which went less far
+    others = [one for one in premises.notes if not one.startswith(note)]
     return dataclasses.replace(best, notes=(*others, f"{note}: they were taken as {told}")), terms
 
 

@@ -204,11 +204,10 @@ def while_still(recording: Recording, trace: Trace) -> Recording:
     Raises:
         InputError: too few are left.
     """
-    travel = np.abs(recording.q - trace.motion.q.mean(0)).max(1)
-    moves = np.flatnonzero(travel > YIELDS)
-    middle = np.searchsorted(recording.time, trace.motion.time.mean())
-    start, stop = (moves[moves < middle][-1:] + 1, moves[moves >= middle][:1])
-    kept = slice(int(start[0]) if len(start) else 0, int(stop[0]) if len(stop) else recording.samples)
+    moves = np.abs(recording.q - trace.motion.q.mean(0)).max(1) > YIELDS
+    first, last = np.searchsorted(recording.time, trace.motion.time[[0, -1]])
+    before, after = np.flatnonzero(moves[:first]), last + np.flatnonzero(moves[last:])
+    kept = slice(int(before[-1]) + 1 if len(before) else 0, int(after[0]) if len(after) else len(moves))
     if kept == slice(0, recording.samples):
         return recording
     still = recording.at(kept)
