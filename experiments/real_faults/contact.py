@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from graabaek import intervals
-from recording import BadFile, Case, Recording, checked, known_content, truth
+from recording import BadFile, Case, Recording, advancing, checked, known_content, numbers, truth
 
 CHANNELS = {"q": "q", "qd": "dq", "tau": "tau_J"}
 FREE = 5.0
@@ -31,21 +31,15 @@ def load(path: Path) -> tuple[Recording, list[list[float]]]:
         wanted = ["time", "label"] + [f"{column}{j}" for column in CHANNELS.values() for j in range(7)]
         if missing := [name for name in wanted if name not in names]:
             raise BadFile(f"{path}: has no column {missing[0]!r}, which labelled recordings of this set have")
-        try:
-            rows = np.array(list(reader), float)
-        except ValueError:
-            raise BadFile(f"{path}: a row is shorter than the header or holds no numbers") from None
-    if rows.ndim != 2 or rows.shape[1] != len(names):
-        raise BadFile(f"{path}: its rows have not the {len(names)} columns of the header")
+        rows = numbers(path, names, reader)
     column = lambda name: rows[:, names.index(name)]
     time = column("time")
-    new = np.diff(time, prepend=-np.inf) > 0
+    new, dropped = advancing(time)
     channels = {
         what: np.stack([column(f"{name}{j}") for j in range(7)], 1)[new] for what, name in CHANNELS.items()
     }
     if np.abs(channels["q"]).max() > np.pi + 0.1:
         raise BadFile(f"{path}: q exceeds what a Panda's joints can turn: not rad")
-    dropped = {"rows whose time does not increase": int(np.sum(~new))}
     log = checked(path, path.stem, time[new], channels, source, dropped)
     return log, intervals(log.time, column("label")[new] != 0)
 

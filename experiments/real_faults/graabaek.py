@@ -10,7 +10,7 @@ from pathlib import Path
 
 import arms
 import numpy as np
-from recording import BadFile, Case, Recording, checked, known_content, truth
+from recording import BadFile, Case, Recording, advancing, checked, known_content, numbers, truth
 from ur import torque_constants
 
 SIX = ("actual_q", "actual_qd", "actual_current", "target_qd", "target_current", "target_moment")
@@ -46,8 +46,7 @@ def load(path: Path) -> Recording:
     if np.abs(six["actual_q"]).max() > 2 * np.pi + 0.1:
         raise BadFile(f"{path}: actual_q exceeds a turn: not rad")
     time = table["timestamp"]
-    new = np.diff(time, prepend=-np.inf) > 0
-    dropped = {"rows whose time does not increase": int(np.sum(~new))}
+    new, dropped = advancing(time)
     constants = torque_constants(path, six["target_qd"], six["target_current"], six["target_moment"])
     source |= {"N m/A": [round(float(k), 3) for k in constants]}
     tau = six["actual_current"] * constants
@@ -81,12 +80,7 @@ def _table(path: Path) -> dict[str, np.ndarray]:
         raise BadFile(
             f"{path}: has no column {missing[0]!r} between blanks, which an RTDE log of this set has"
         )
-    try:
-        rows = np.array([line.split() for line in lines[1:]], float)
-    except ValueError:
-        raise BadFile(f"{path}: a row is shorter than the header or holds no numbers") from None
-    if rows.ndim != 2 or rows.shape[1] != len(names):
-        raise BadFile(f"{path}: its rows have not the {len(names)} columns of the header")
+    rows = numbers(path, names, map(str.split, lines[1:]))
     return {name: rows[:, names.index(name)] for name in wanted}
 
 

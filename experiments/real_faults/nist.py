@@ -10,7 +10,7 @@ from pathlib import Path
 
 import arms
 import numpy as np
-from recording import BadFile, Case, Recording, checked, known_content, truth
+from recording import BadFile, Case, Recording, advancing, checked, known_content, truth
 from ur import torque_constants
 
 POUND = 0.45359237
@@ -57,8 +57,7 @@ def load(path: Path) -> Recording:
     source = known_content(path, "nist_ur5")
     table = _npz(path) if path.suffix == ".npz" else _csv(path)
     time = table[:, 0]
-    new = np.diff(time, prepend=-np.inf) > 0
-    dropped = {"rows whose time does not increase": int(np.sum(~new))}
+    new, dropped = advancing(time)
     table, time = table[new], time[new]
     six = lambda what: table[:, [COLUMNS.index(f"{SIX[what]} (J{j})") for j in range(1, 7)]]
     q = six("q") * _unit(path, time, six("q"), six("qd"))
@@ -117,7 +116,7 @@ def _in_order(path, table, names) -> np.ndarray:
 
 def _unit(path, time, q, qd) -> float:
     """rad for one of the file: its velocities, which are in rad/s, tell degrees from radians."""
-    new = np.diff(time, prepend=-np.inf) > 0
+    new, _ = advancing(time)
     slope = np.gradient(q[new], time[new], axis=0)
     ratio = np.sum(slope * qd[new]) / max(np.sum(qd[new] ** 2), 1e-12)
     for unit in (1.0, np.pi / 180):

@@ -76,6 +76,23 @@ def known_content(path: Path, collection: str) -> dict:
     return entry
 
 
+def advancing(time: np.ndarray) -> tuple[np.ndarray, dict]:
+    """Rows whose stamp increases, and how many do not."""
+    new = np.diff(time, prepend=-np.inf) > 0
+    return new, {"rows whose time does not increase": int(np.sum(~new))}
+
+
+def numbers(path: Path, names: list[str], rows) -> np.ndarray:
+    """Cells of a table as numbers, as many in each row as the header has."""
+    try:
+        table = np.array(list(rows), float)
+    except ValueError:
+        raise BadFile(f"{path}: a row is shorter than the header or holds no numbers") from None
+    if table.ndim != 2 or table.shape[1] != len(names):
+        raise BadFile(f"{path}: its rows have not the {len(names)} columns of the header")
+    return table
+
+
 def checked(path, name, time, channels: dict, source, dropped=None) -> Recording:
     """A recording of these channels; numbers that are none, or a clock that does not go on, are refused."""
     for what, values in {"time": time, **channels}.items():

@@ -8,9 +8,6 @@ and leaves it as report.txt, all figures as results.json. Needs the cases and th
 
 import argparse
 import json
-import os
-import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -18,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from real_arms.score import LIMIT, call
 from scoring import FAMILY_OF
 
 LEVELS = (0.5, 0.9)
-LIMIT = 1800.0
 
 
 # ------------------------------------------------------------------------------------ running the tool
@@ -31,21 +28,14 @@ def answer(case: Path, out: Path, limit: float) -> dict:
     """Runs the diagnosis; status and seconds are kept in run.json."""
     out.mkdir(parents=True, exist_ok=True)
     truth = json.loads((case / "truth.json").read_text())
-    command = [sys.executable, "-m", "jaxpanda", "diagnose", "--recording", case / "recording.csv"]
+    arguments = ["diagnose", "--recording", case / "recording.csv"]
     if (case / "model.xml").exists():
-        command += ["--model", case / "model.xml"]
+        arguments += ["--model", case / "model.xml"]
     if before := sorted(case.glob("reference_*.csv")):
-        command += ["--reference", *before]
-    command = [*map(str, command), *truth["arguments"], "--out", str(out)]
+        arguments += ["--reference", *before]
     start = time.perf_counter()
-    with (out / "log.txt").open("w") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
-        try:
-            status = process.wait(limit)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)  # its own session, so only what it started
-            process.wait()
-            status = 124
+    status, printed = call([*arguments, *truth["arguments"], "--out", out], limit)
+    (out / "log.txt").write_text(printed)
     run = {"status": status, "seconds": round(time.perf_counter() - start, 1)}
     (out / "run.json").write_text(json.dumps(run))
     return run
