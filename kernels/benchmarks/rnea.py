@@ -406,6 +406,8 @@ def main() -> None:
     parser.add_argument("--baseline", action="store_true", help=f"replace {BASELINE.name}")
     parser.add_argument("--child", nargs=2, metavar=("CORES", "FOLDER"), help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.warp and not (args.gpu and util.find_spec("mujoco_warp")):
+        parser.error("--warp needs --gpu and the package mujoco-warp")
     if args.child:
         print(json.dumps(measure(int(args.child[0]), args.batch, args.rounds, Path(args.child[1]))))
         return
