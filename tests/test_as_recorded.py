@@ -11,7 +11,7 @@ import scipy.signal
 from jaxpanda import Arm, Recording
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis.as_recorded import as_recorded, misleading, predicted
-from jaxpanda.diagnosis.traces import held_sign, prepare
+from jaxpanda.diagnosis.traces import held_sign, prepare, trajectory
 from jaxpanda.effects import Turn
 from jaxpanda.effects.drive import Armature
 from jaxpanda.effects.friction import ViscousFriction
@@ -30,7 +30,7 @@ def rubbing(arm: Arm, turns: Sequence[Turn | None]) -> Recording:
     q = 0.5 * np.asarray(arm.lower + arm.upper) + 0.05 / 0.7 * np.sin(phase)
     frictionless = dataclasses.replace(arm, frictionloss=jnp.zeros(7))
     still = Recording("slow.csv", time, q, tau=np.zeros((len(time), 7)))
-    load = prepare(still, frictionless, whole=True, noise=NOISE).motion.torque
+    load = trajectory(still).trace(frictionless).motion.torque
     sign = held_sign(arm, qd, -0.05 * 0.7 * np.sin(phase), np.full(7, 1e-6))
     for joint, turn in enumerate(turns):
         if turn == SPEED:
@@ -58,10 +58,10 @@ def test_friction_of_the_model_turns_in_predictions_as_it_did_in_the_recordings(
     zeros = jnp.zeros(7)
     corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
     recording = rubbing(arm, turns)
-    found = as_recorded([recording], corrected, NOISE)
+    found = as_recorded([recording], corrected)
     assert found.turns == turns
     assert Corrected.from_json(found.to_json()).turns == turns
-    error = predicted(recording, found, NOISE)[1] - recording.tau
+    error = predicted(trajectory(recording), found)[1] - recording.tau
     assert np.all(np.std(error, axis=0) < 1.1 * NOISE)
 
 
@@ -81,7 +81,7 @@ def reversing(arm: Arm, filtered: tuple[int, ...], speed: float) -> Recording:
     phase = speed * time[:, None] + np.arange(7)
     q = 0.5 * np.asarray(arm.lower + arm.upper) + 0.1 * np.arcsin(0.99 * np.sin(phase))
     still = Recording("swings.csv", time, q, tau=np.zeros((len(time), 7)))
-    tau = prepare(still, arm, whole=True, noise=NOISE).motion.torque
+    tau = trajectory(still).trace(arm).motion.torque
     b, a = scipy.signal.butter(1, 5.0, fs=500.0)
     for joint in filtered:
         tau[:, joint] = scipy.signal.filtfilt(b, a, tau[:, joint])
@@ -93,11 +93,11 @@ def test_prediction_takes_no_more_of_fast_motion_than_the_torque_showed():
     arm = Arm.panda()
     zeros = jnp.zeros(7)
     plain = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
-    found = as_recorded([reversing(arm, (1, 3), 6.0)], plain, NOISE)
+    found = as_recorded([reversing(arm, (1, 3), 6.0)], plain)
     assert [cutoff is not None for cutoff in found.cutoffs] == [j in (1, 3) for j in range(7)]
     assert Corrected.from_json(found.to_json()).cutoffs == found.cutoffs
     faster = reversing(arm, (1, 3), 8.0)
-    error = lambda corrected: np.std(predicted(faster, corrected, NOISE)[1] - faster.tau, axis=0)
+    error = lambda corrected: np.std(predicted(trajectory(faster), corrected)[1] - faster.tau, axis=0)
     assert np.all(error(found)[[1, 3]] < 0.8 * error(plain)[[1, 3]])
     np.testing.assert_array_equal(np.delete(error(found), [1, 3]), np.delete(error(plain), [1, 3]))
 
@@ -110,9 +110,9 @@ def test_of_a_long_recording_the_beginning_is_compared(monkeypatch):
     later = rubbing(dataclasses.replace(arm, frictionloss=jnp.full(7, 5.0)), ())
     half = len(first.time) // 2
     both = dataclasses.replace(first, tau=np.concatenate([first.tau[:half], later.tau[half:]]))
-    assert as_recorded([both], corrected, NOISE).turns != (SPEED,) * 7
+    assert as_recorded([both], corrected).turns != (SPEED,) * 7
     monkeypatch.setattr("jaxpanda.diagnosis.as_recorded.LONG", float(first.time[half - 1]))
-    assert as_recorded([both], corrected, NOISE).turns == (SPEED,) * 7
+    assert as_recorded([both], corrected).turns == (SPEED,) * 7
 
 
 def test_torque_of_changed_links_is_that_of_the_regressor():
@@ -129,12 +129,12 @@ def test_effects_that_make_the_recordings_own_torque_worse_are_named():
     lacking = Corrected(Arm.panda(), jnp.zeros((7, 10)), zeros, zeros, (), ())
     damped = tuple(ViscousFriction(j) for j in range(7)), (jnp.array([0.5]),) * 7
     right = dataclasses.replace(lacking, effects=damped[0], coefficients=damped[1])
-    assert misleading([recording], right, NOISE, 7) == set()
+    assert misleading([recording], right, 7) == set()
     wrong = dataclasses.replace(
         right,
         effects=(*damped[0], Armature(5, "signed")),
         coefficients=(*damped[1], jnp.array([0.02])),
     )
-    assert misleading([recording], wrong, NOISE, 8) == {7}
-    assert misleading([recording], wrong, NOISE, 1) == {0}
-    assert misleading([recording], lacking, NOISE, 0) == set()
+    assert misleading([recording], wrong, 8) == {7}
+    assert misleading([recording], wrong, 1) == {0}
+    assert misleading([recording], lacking, 0) == set()

@@ -25,7 +25,7 @@ from jaxpanda.diagnosis.state import (
     with_terms,
     without,
 )
-from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.diagnosis.traces import prepare, trajectory
 from jaxpanda.effects import CATALOGUE, neighbours
 from jaxpanda.effects.drive import Armature, JointSpring, TorqueRipple
 from jaxpanda.effects.friction import (
@@ -306,7 +306,7 @@ def resting(level: float, held: float, seconds: float = 30.0):
     q = r.q.copy()
     q[:, 3] = -1.5 + 0.5 * np.sin(6 * np.pi * np.cumsum(moves) / len(moves))
     q += 1e-5 * rng.normal(size=q.shape)
-    motion = prepare(dataclasses.replace(r, q=q, tau=None), Arm.panda(), whole=True).motion
+    motion = trajectory(dataclasses.replace(r, q=q, tau=None)).trace(Arm.panda()).motion
     tau, speed = (
         np.stack([np.interp(r.time, motion.time, x) for x in channel.T], 1)
         for channel in (motion.torque, motion.qd)

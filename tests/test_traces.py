@@ -11,7 +11,7 @@ from helpers import record
 from mjcf_cases import chain_of
 
 from jaxpanda import Arm, Recording
-from jaxpanda.diagnosis.traces import WORK_RATE, held_sign, prepare, work_rate
+from jaxpanda.diagnosis.traces import WORK_RATE, held_sign, prepare, trajectory, work_rate
 from jaxpanda.effects.friction import FrictionDrift, LoadDependentFriction
 from jaxpanda.effects.motion import Channels
 from jaxpanda.effects.sensing import TorqueDrift
@@ -134,7 +134,7 @@ def test_a_prediction_keeps_a_fast_motion_in_the_last_second():
 
 def predicted_acceleration(recording: Recording) -> np.ndarray:
     """On the recording's own times [rad/s²]."""
-    trace = prepare(recording, Arm.panda(), whole=True)
+    trace = trajectory(recording).trace(Arm.panda())
     return np.stack([np.interp(recording.time, trace.motion.time, x) for x in trace.motion.qdd.T], 1)
 
 

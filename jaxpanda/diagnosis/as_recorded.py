@@ -15,7 +15,7 @@ from jaxtyping import Float
 from ..corrected import Corrected
 from ..effects import Turn
 from ..recordings import Recording
-from .traces import Trace, prepare
+from .traces import Trace, Trajectory, trajectory
 
 TURNS = (Turn("speed", 0.01), *(Turn("distance", x) for x in (3e-4, 7e-4, 1.5e-3, 3e-3, 6e-3)))
 """How friction of a gear may turn [rad/s, rad]."""
@@ -27,41 +27,35 @@ MOST = 0.5
 """Of the squared error of predictions, what must be motion that the torque does not show."""
 
 
-def as_recorded(
-    recordings: Sequence[Recording], corrected: Corrected, noise: Float[np.ndarray, " dof"]
-) -> Corrected:
+def as_recorded(recordings: Sequence[Recording], corrected: Corrected) -> Corrected:
     """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings."""
-    recordings = [_beginning(recording) for recording in recordings]
-    best = dataclasses.replace(corrected, turns=_turns(recordings, corrected, noise))
+    moved = [trajectory(_beginning(recording)) for recording in recordings]
+    best = dataclasses.replace(corrected, turns=_turns(moved, corrected))
     each = [dataclasses.replace(best, cutoffs=(cutoff,) * corrected.arm.dof) for cutoff in CUTOFFS]
-    slower = [_squares(recordings, one, noise) for one in each]
+    slower = [_squares(moved, one) for one in each]
     # a smaller share may be noise of q, and another motion faster
-    filtered = np.min(slower, 0) < MOST * _squares(recordings, best, noise)
+    filtered = np.min(slower, 0) < MOST * _squares(moved, best)
     cutoffs = [CUTOFFS[k] if low else None for k, low in zip(np.argmin(slower, 0), filtered, strict=True)]
     return dataclasses.replace(best, cutoffs=tuple(cutoffs) if any(filtered) else ())
 
 
-def _turns(
-    recordings: Sequence[Recording], corrected: Corrected, noise: Float[np.ndarray, " dof"]
-) -> tuple[Turn | None, ...]:
+def _turns(moved: Sequence[Trajectory], corrected: Corrected) -> tuple[Turn | None, ...]:
     """How the friction of each joint turned."""
     if not np.any(np.asarray(corrected.arm.frictionloss + corrected.frictionloss_change)):
         return ()
     ways = (None, *TURNS)
     each = [dataclasses.replace(corrected, turns=(way,) * corrected.arm.dof) for way in ways]
-    nearest = np.argmin([_squares(recordings, one, noise) for one in each], 0)
+    nearest = np.argmin([_squares(moved, one) for one in each], 0)
     return tuple(ways[k] for k in nearest) if any(nearest) else ()
 
 
-def misleading(
-    recordings: Sequence[Recording], corrected: Corrected, noise: Float[np.ndarray, " dof"], count: int
-) -> set[int]:
+def misleading(recordings: Sequence[Recording], corrected: Corrected, count: int) -> set[int]:
     """Which of the last `count` effects make the recordings' own torque be predicted worse.
 
     A search compares motion and torque below the frequency up to which both are known; a prediction shows all of
     the motion. What only fitted the slow part is no law of this arm.
     """
-    traces = [predicted(recording, corrected, noise)[0] for recording in recordings]
+    traces = [predicted(trajectory(recording), corrected)[0] for recording in recordings]
     counts = np.concatenate([t.weight > 0 for t in traces])
     measured = np.concatenate([np.asarray(t.tau) for t in traces])[counts]
     squares = lambda x: np.maximum(np.sum((measured - x) ** 2, 0), 1e-300)
@@ -87,16 +81,12 @@ def misleading(
     return gone
 
 
-def predicted(
-    recording: Recording, corrected: Corrected, noise: Float[np.ndarray, " dof"]
-) -> tuple[Trace, Float[np.ndarray, "time dof"]]:
+def predicted(moved: Trajectory, corrected: Corrected) -> tuple[Trace, Float[np.ndarray, "time dof"]]:
     """A motion on the grid of a prediction, and the torque there [N m]."""
     out: dict[float | None, tuple[Trace, np.ndarray]] = {}
     cutoffs = corrected.cutoffs or (None,) * corrected.arm.dof
     for cutoff in dict.fromkeys(cutoffs):
-        trace = prepare(
-            recording, corrected.arm, whole=True, noise=noise, turns=corrected.turns, below=cutoff
-        )
+        trace = moved.trace(corrected.arm, corrected.turns, np.inf if cutoff is None else cutoff)
         out[cutoff] = trace, corrected.measured_torque(trace.motion, trace.channels, trace.sign)
     torque = np.stack([out[cutoff][1][:, joint] for joint, cutoff in enumerate(cutoffs)], 1)
     return out[cutoffs[0]][0], torque
@@ -117,13 +107,11 @@ def _beginning(recording: Recording) -> Recording:
     return recording.at(slice(count))
 
 
-def _squares(
-    recordings: Sequence[Recording], corrected: Corrected, noise: Float[np.ndarray, " dof"]
-) -> Float[np.ndarray, " dof"]:
+def _squares(moved: Sequence[Trajectory], corrected: Corrected) -> Float[np.ndarray, " dof"]:
     """Of the errors of predicted torque in all recordings, without gaps, in sum [N² m²]."""
     out = np.zeros(corrected.arm.dof)
-    for recording in recordings:
-        trace, torque = predicted(recording, corrected, noise)
+    for one in moved:
+        trace, torque = predicted(one, corrected)
         assert trace.tau is not None
         out += np.sum((trace.tau - torque)[trace.weight > 0] ** 2, 0)
     return out

@@ -192,10 +192,10 @@ def sought(
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
     contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
     wrong = numbers(problem, state, premises.changes) if contradicted else []
-    kept, quiet = transferable(problem, laws), problem.noise(()).std
+    kept = transferable(problem, laws)
     correct = lambda by: _corrected(arm, premises, by, refitted=bool(by.terms or wrong))
     corrected = correct(kept)
-    if worse := misleading(recordings, corrected, quiet, len(kept.terms)):
+    if worse := misleading(recordings, corrected, len(kept.terms)):
         kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
         corrected = correct(kept)
     lost = [all(t is not k for k in kept.terms) for t in laws.terms]
@@ -220,7 +220,7 @@ def sought(
             "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
             f" or with all of the motion: {', '.join(sorted(dropped))}"
         )
-    corrected = as_recorded(recordings, buildable(source, corrected, problem), quiet)
+    corrected = as_recorded(recordings, buildable(source, corrected, problem))
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     made = Diagnosis(
         verdict=answer,

@@ -25,7 +25,7 @@ from .diagnosis import Diagnosis, sought
 from .host import on_host
 from .meaning import Misread, misread
 from .resting import AtRest, judge, rests, while_still
-from .traces import Trace, prepare, work_rate
+from .traces import Trace, prepare, trajectory, work_rate
 from .two_sided import TwoSided, both, drive_alone, links_alone, notes_of, on_drives, on_motors, passed_on
 from .written import file_with
 
@@ -174,13 +174,13 @@ def predict_sides(
     require_x64("a prediction")
     recording = motion if isinstance(motion, Recording) else load(motion)
     sides = read_sides(folder, effects)
-    corrected, noise = sides[0] if sides else read(folder, effects)
+    corrected, _ = sides[0] if sides else read(folder, effects)
     recording.require_dof(corrected.arm.dof)
-    trace, torque = predicted(recording.of_link_side(), corrected, noise)
+    trace, torque = predicted(trajectory(recording.of_link_side()), corrected)
     tau = at_rows(recording, trace.motion.time, torque)
     if not sides:
         return tau, None
     passed = passed_on(corrected, recording, tau)
     view = dataclasses.replace(recording, tau=None, tau_motor=None, transmitted=passed)
-    trace, torque = predicted(view, *sides[1])
+    trace, torque = predicted(trajectory(view), sides[1][0])
     return tau, at_rows(recording, trace.motion.time, torque)

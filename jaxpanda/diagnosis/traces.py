@@ -8,13 +8,11 @@ the cutoff of the torque: an autoregressive noise model on samples closer than t
 import dataclasses
 import functools
 import itertools
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import scipy.interpolate
 import scipy.ndimage
-import scipy.signal
 from jaxtyping import Float
 
 from .. import signals as signals_
@@ -23,6 +21,7 @@ from ..arms.mjcf import SOLIMP, SOLREF
 from ..effects import Channels, Motion, Stretches, Turn, masses
 from ..errors import InputError
 from ..recordings import Recording
+from ..smoothing import Smoothed, continued_derivatives, smooth
 
 WORK_RATE = 100.0
 """Rate of the coarse grid, at most [Hz]."""
@@ -33,17 +32,8 @@ FINER = 10.0
 """Rate of the fine grid over that of the coarse one, at most."""
 POSITION_CUTOFF = 12.0
 """Low-pass of q before it is differentiated, at most [Hz]."""
-_LEAST_CUTOFF, _LEAST_WHOLE = 5.0, 2.5
-"""The least low-pass of q for a diagnosis, and for a prediction [Hz]."""
-_WINDOW, _SMOOTH = 4.0, 3.0
-"""For the spectrum of the acceleration: a stretch [s], and a low-pass by which a motion is smooth [Hz]."""
-_BANDS, _COUNTS = ((0.15, 0.25), (0.25, 0.35), (0.35, 0.5)), 2.0
-"""Shares of the rate between which noise of q is told; and how often it counts against motion, as filled gaps and
-other joints' inertia put more of it into the torque."""
-_CUTOFFS = 60
-"""Of which the best is taken."""
-_WIDER = 1.15
-"""Within which ratio of frequencies power is averaged before it is told from noise."""
+_LEAST_CUTOFF = 5.0
+"""The least low-pass of q [Hz]."""
 TRIM = 0.4
 """Left out at both ends of a recording [s]."""
 _REST = 5.0
@@ -72,8 +62,8 @@ _AT_ONCE = 24
 """Samples of the coarse grid that one product filters."""
 _UNFELT = 1e-12
 """Share of the low-pass filter's response that is cut off at either end."""
-_CONTINUED = 0.3
-"""At the ends of a recording, over which q is fitted to continue it [s]."""
+_FELT = 0.4
+"""Share of the coarse grid's rate up to which it holds motion and torque."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,62 +171,117 @@ def work_rate(recordings: Sequence[Recording]) -> float:
     return max(_LEAST_RATE, WORK_RATE * _LONG / max(seconds, _LONG))
 
 
+@dataclasses.dataclass(frozen=True)
+class Trajectory:
+    """A whole recording on a uniform grid, ends and gaps included, differentiated as exactly as q allows."""
+
+    recording: Recording
+    signals: signals_.Signals
+    smoothed: Smoothed
+    slowest: Float[np.ndarray, "time dof"]
+    """Speeds that noise of q may pretend [rad/s]."""
+
+    def trace(self, arm: Arm, turns: Sequence[Turn | None] = (), below: float = np.inf) -> Trace:
+        """On the grids of a prediction.
+
+        Args:
+            arm: whose torque is to be predicted; without links, where the recording says what they take.
+            turns: how each joint's Coulomb friction turns; None, or no entries: as MuJoCo's constraint does.
+            below: low-pass of the motion, where that is lower than what q shows [Hz].
+        """
+        rate = self.signals.rate
+        motion = self.smoothed.q, self.smoothed.qd, self.smoothed.qdd
+        if below < _most(rate):
+            motion = tuple(signals_.zero_phase(x, below, rate) for x in motion)
+        keep = np.arange(0, len(self.signals.time), max(1, int(rate / (FINER * WORK_RATE) + 1e-6)))
+        return _on_grids(self.recording, self.signals, keep, motion, self.slowest, arm, turns, WORK_RATE)
+
+
+def trajectory(recording: Recording) -> Trajectory:
+    """A recording, or a motion without torque, for predictions."""
+    signals = signals_.prepare(recording, cutoff=3.0, rate=WORK_RATE, trim=0.0)
+    rate, time, rows = signals.rate, signals.time, recording.time
+    position = _across_gaps(_splined(recording, time), rows, recording.q, time, rate)
+    step = _least_step(recording.q)
+    moved = smooth(position, np.where(np.isfinite(step), step, 0.0), rate, _most(rate))
+    slowest = _REST * _velocity_noise(_position_noise(position), moved.cutoff, rate)
+    return Trajectory(recording, signals, moved, slowest)
+
+
+def _most(rate: float) -> float:
+    """The highest low-pass of q in a trajectory of that rate [Hz]."""
+    return min(signals_.DERIVATIVE_CUTOFF, 0.25 * rate)
+
+
 def prepare(
     recording: Recording,
     arm: Arm,
     *,
-    whole: bool = False,
     noise: Float[np.ndarray, " dof"] | None = None,
-    turns: Sequence[Turn | None] = (),
-    below: float | None = None,
     coarse: float = WORK_RATE,
 ) -> Trace:
-    """A recording on its two grids.
+    """A recording on its two grids, for a diagnosis.
 
     Args:
         recording: with torque, or a motion.
         arm: whose nominal torque is to be compared; without links, where the recording says what they take.
-        whole: one grid for all, ends and gaps included, as prediction needs.
         noise: of the torque [N m], where the recording does not tell.
-        turns: how each joint's Coulomb friction turns; None, or no entries: as MuJoCo's constraint does.
-        below: low-pass of q, where that is lower than what q shows [Hz].
         coarse: rate of the coarse grid, at most; motion above 0.4 of it is left out, as in the torque [Hz].
     """
-    rough = signals_.prepare(recording, cutoff=3.0, rate=coarse, trim=0.0 if whole else TRIM)
-    rate, time = rough.rate, rough.time
-    spline = scipy.interpolate.CubicSpline(recording.time, recording.q)
-    position = spline(np.clip(time, *recording.time[[0, -1]]))
-    if whole:  # elsewhere samples beside a gap do not count
-        position = _across_gaps(position, recording.time, recording.q, time, rate)
+    rough = signals_.prepare(recording, cutoff=3.0, rate=coarse, trim=TRIM)
+    rate, time, keep = rough.rate, rough.time, rough.keep
+    position = _splined(recording, time)
     if noise is None and rough.tau is not None:
         noise = signals_.white_noise(rough.tau)
-    if whole:
-        cutoff_q = _clearest_cutoff(position, _least_step(recording.q), noise, arm, rate)
-    else:
-        cutoff_q = position_cutoff(position, noise, arm, rate)
-    cutoff_q = min(cutoff_q, 0.4 * coarse, np.inf if below is None else below)
-    q, qd, qdd = _derivatives(position, cutoff_q, rate)
+    cutoff_q = min(position_cutoff(position, noise, arm, rate), _FELT * coarse)
+    q, qd, qdd = continued_derivatives(position, cutoff_q, rate)
     width = _REST * _velocity_noise(_position_noise(position), cutoff_q, rate)
+    trace = _on_grids(recording, rough, keep, (q, qd, qdd), width, arm, (), coarse)
+    doubtful = _unsure_sign(position, qd, width + _TURN * np.abs(qdd), cutoff_q, rate)[keep]
+    trace = dataclasses.replace(trace, unsure=doubtful)
+    if noise is None:
+        return trace
+    motion = trace.motion
+    unsure = np.asarray(arm.frictionloss) * doubtful
+    cut_off = _cut_off(position, qdd, cutoff_q, rate)[keep]
+    unsure = np.hypot(unsure, (np.abs(motion.mass) @ cut_off[:, :, None])[:, :, 0])
+    trust = 1 / np.sqrt(1 + (unsure / np.maximum(noise, 1e-12)) ** 2)
+    trust[:, np.ptp(motion.q, axis=0) < _HELD] = 0.0
+    stuck = () if recording.tau is None else _stuck(recording.time, recording.tau, motion, noise)
+    for joint, start, stop in stuck:
+        trust[(motion.time > start - _NEAR) & (motion.time < stop + _NEAR), joint] = 0.0
+    return dataclasses.replace(trace, trust=trust, stuck=stuck)
 
-    thinnest = max(1, int(rate / (FINER * coarse) + 1e-6))
-    keep = np.arange(0, len(time), thinnest) if whole else rough.keep
-    stride = int(np.min(np.diff(keep)))
+
+def _on_grids(
+    recording: Recording,
+    signals: signals_.Signals,
+    keep: np.ndarray,
+    moved: Sequence[Float[np.ndarray, "time dof"]],
+    least: Float[np.ndarray, "*time dof"],
+    arm: Arm,
+    turns: Sequence[Turn | None],
+    coarse: float,
+) -> Trace:
+    """A motion, its derivatives and its torque on a fine grid and on the coarse one of the samples `keep`."""
+    rate, time = signals.rate, signals.time
+    thinnest, stride = max(1, int(rate / (FINER * coarse) + 1e-6)), int(np.min(np.diff(keep)))
     thin = next(k for k in range(min(stride, thinnest), 0, -1) if stride % k == 0)
     fine = np.arange(keep[0] % thin, len(time), thin)
     kept, dt = (keep - fine[0]) // thin, thin / rate
-    cutoff = min(0.4 * rate / stride, 0.45 * rate)
+    cutoff = min(_FELT * rate / stride, 0.45 * rate)
+    q, qd, qdd = moved
 
-    sign = held_sign(arm, qd[fine], qdd[fine], width)
+    sign = held_sign(arm, qd[fine], qdd[fine], np.broadcast_to(least, q.shape)[fine])
     for joint, turn in enumerate(turns):
         if turn is not None:
             sign[:, joint] = turn.share(q[fine, joint], qd[fine, joint])
-    doubtful = _unsure_sign(position, qd, width + _TURN * np.abs(qdd), cutoff_q, rate)[fine][kept]
     held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
     held = held_fine[kept]
     if stride > thin:
         held = signals_.zero_phase(held_fine, cutoff, 1 / dt)[kept]
     coarsely = lambda x: (signals_.zero_phase(x, cutoff, rate) if stride > 1 else x)[keep]
-    tau = None if rough.tau is None else coarsely(rough.tau)
+    tau = None if signals.tau is None else coarsely(signals.tau)
     passed = recording.transmitted
     if passed is not None:
         passed = coarsely(signals_.resampled(recording.time, passed, time))
@@ -251,21 +296,13 @@ def prepare(
     channels = Channels(time[fine], q[fine], qd[fine], qdd[fine], load, load + held_fine, shown)
     weight = _weight(recording.time, time[keep], rate)
     trust = np.ones(motion.q.shape)
-    if noise is not None:
-        unsure = np.asarray(arm.frictionloss) * doubtful
-        cut_off = _cut_off(position, qdd, cutoff_q, rate)[keep]
-        unsure = np.hypot(unsure, (np.abs(motion.mass) @ cut_off[:, :, None])[:, :, 0])
-        trust = 1 / np.sqrt(1 + (unsure / np.maximum(noise, 1e-12)) ** 2)
-        if not whole:
-            trust[:, np.ptp(motion.q, axis=0) < _HELD] = 0.0
-    stuck = ()
-    if recording.tau is not None and noise is not None and not whole:
-        stuck = _stuck(recording.time, recording.tau, motion, noise)
-    for joint, start, stop in stuck:
-        trust[(motion.time > start - _NEAR) & (motion.time < stop + _NEAR), joint] = 0.0
-    return Trace(
-        recording.name, rough, channels, dt, motion, tau, weight, kept, cutoff, sign, trust, doubtful, stuck
-    )
+    return Trace(recording.name, signals, channels, dt, motion, tau, weight, kept, cutoff, sign, trust)
+
+
+def _splined(recording: Recording, time: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time dof"]:
+    """Positions on a grid, by a cubic spline through the rows."""
+    rows = recording.time
+    return scipy.interpolate.CubicSpline(rows, recording.q)(np.clip(time, *rows[[0, -1]]))
 
 
 def _stuck(
@@ -331,22 +368,6 @@ def _weight(
     return weight
 
 
-def _derivatives(q: Float[np.ndarray, "time dof"], cutoff: float, rate: float):
-    """`signals.derivatives`, with q continued beyond its ends by quartics: an arm may be cut off in motion."""
-    count = min(max(8, round(_CONTINUED * rate)), len(q))
-    more = max(4, round(0.2 * rate))
-    x = np.arange(count) / rate
-    ends = []
-    for part, at in (
-        (q[:count], -np.arange(more, 0, -1) / rate),
-        (q[-count:], x[-1] + np.arange(1, more + 1) / rate),
-    ):
-        fitted = np.polynomial.polynomial.polyfit(x, part, 4)
-        ends.append(np.polynomial.polynomial.polyval(at, fitted).T)
-    longer = signals_.derivatives(np.concatenate([ends[0], q, ends[1]]), cutoff, rate)
-    return tuple(part[more:-more] for part in longer)
-
-
 def _unsure_sign(
     q: Float[np.ndarray, "time dof"],
     qd: Float[np.ndarray, "time dof"],
@@ -372,7 +393,7 @@ def _cut_off(
 ) -> Float[np.ndarray, "time dof"]:
     """Acceleration that the filter of q takes away [rad/s²]: where it is far above its noise, and a share of it
     as long as the filter rings around there; else 0."""
-    lost = np.abs(_derivatives(q, min(_SHARPER * cutoff, 0.4 * rate), rate)[2] - qdd)
+    lost = np.abs(continued_derivatives(q, min(_SHARPER * cutoff, 0.4 * rate), rate)[2] - qdd)
     noise = np.median(lost, axis=0) / 0.6745
     lost = np.where(lost > _SHARP * noise, lost, 0.0)
     near, far = (
@@ -386,7 +407,7 @@ def held_sign(
     arm: Arm,
     qd: Float[np.ndarray, "time dof"],
     qdd: Float[np.ndarray, "time dof"],
-    least: Float[np.ndarray, " dof"],
+    least: Float[np.ndarray, "*time dof"],
 ) -> Float[np.ndarray, "time dof"]:
     r"""Share of its frictionloss at which each joint's friction stands in MuJoCo, -1 to 1.
 
@@ -426,68 +447,6 @@ def position_cutoff(
     return float(np.clip(1.3 * crossing.min(), min(_LEAST_CUTOFF, most), most))
 
 
-def _clearest_cutoff(
-    q: Float[np.ndarray, "time dof"],
-    step: Float[np.ndarray, " dof"],
-    noise: Float[np.ndarray, " dof"] | None,
-    arm: Arm,
-    rate: float,
-) -> float:
-    r"""Where a low-pass leaves least of both in the torque: noise of $\ddot q$ below it, motion above it [Hz].
-
-    A diagnosis can weigh down samples whose motion the filter takes away; a prediction has to have them. Power
-    of $\ddot q$ is the motion's where it stands so far above that of q's noise that it is worth its noise; joints
-    count by $(M_{jj}/\sigma_{\tau,j})^2$. The noise is white, or that of a smooth motion written in steps.
-    """
-    M = np.diag(masses(arm, q.mean(0)[None])[0])
-    if not np.any(M):  # noise of q does no harm
-        return min(POSITION_CUTOFF, 0.25 * rate)
-
-    # whole half windows, and mirrored beyond the ends: every instant counts, the last ones too
-    count = len(q) - 2
-    window = 2 * (count // max(2, math.ceil(2 * count / (_WINDOW * rate))))
-
-    def spectrum(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        qdd = np.diff(x, n=2, axis=0) * rate**2
-        qdd = np.pad(qdd, ((window // 2, window // 2), (0, 0)), "symmetric")
-        return scipy.signal.welch(qdd, rate, nperseg=window, axis=0)
-
-    f, power = spectrum(q)
-    smooth = signals_.zero_phase(q, _SMOOTH, rate)
-    written = np.maximum(np.where(np.isfinite(step), step, 0.0), 1e-12)
-    _, rounding = spectrum(q[0] + np.round((smooth - q[0]) / written) * written - smooth)
-    twice = ((2 * rate * np.sin(np.pi * f / rate)) ** 4)[:, None]
-    levels = power[1:] / twice[1:]
-    white = np.max(
-        [np.median(levels[(f[1:] > low * rate) & (f[1:] <= high * rate)], 0) for low, high in _BANDS], 0
-    )
-    shaken = np.maximum(white * twice, rounding)
-    reach = np.searchsorted(f, f / _WIDER), np.searchsorted(f, f * _WIDER, side="right")
-    sums = np.cumsum(np.concatenate([np.zeros((1, q.shape[1])), power]), 0)
-    level = (sums[reach[1]] - sums[reach[0]]) / np.maximum(reach[1] - reach[0], 1)[:, None]
-    shaken = np.maximum(shaken, _rising(f, level, rate))
-    moved = np.where(level > (1 + _COUNTS) * shaken, power, 0.0)
-    unit = M if noise is None else M / np.maximum(noise, 1e-12)
-    cutoffs = np.geomspace(min(_LEAST_WHOLE, 0.25 * rate), 0.25 * rate, _CUTOFFS)
-    passed = signals_.zero_phase_gain(f, cutoffs)
-    left = (1 - passed) ** 2 @ moved + _COUNTS * passed**2 @ shaken
-    return float(cutoffs[np.argmin(left @ unit**2)])
-
-
-def _rising(
-    f: Float[np.ndarray, " frequencies"], power: Float[np.ndarray, "frequencies dof"], rate: float
-) -> Float[np.ndarray, "frequencies dof"]:
-    r"""Noise of $\ddot q$ by the shape of its spectrum: that of a motion falls, and noise rises.
-
-    Jitter of stamps rises with $f^2$, white noise of q with $f^4$. As much of the power as would rise with f and
-    exceed it nowhere beyond is noise; a motion of one frequency stands above it.
-    """
-    seen = (f > 0) & (f <= _BANDS[-1][0] * rate)
-    slope = np.where(seen[:, None], power, np.inf) / np.maximum(f, f[1])[:, None]
-    least = np.minimum.accumulate(slope[::-1], 0)[::-1]
-    return np.where(np.isfinite(least), least, 0.0) * f[:, None]
-
-
 def _least_step(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
     """The least difference between two rows, which is what they are written in; infinite where all are alike."""
     steps = np.abs(np.diff(x, axis=0))
@@ -500,7 +459,7 @@ def _position_noise(q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof
 
 
 def _velocity_noise(
-    noise: Float[np.ndarray, " dof"], cutoff: float, rate: float
-) -> Float[np.ndarray, " dof"]:
+    noise: Float[np.ndarray, " dof"], cutoff: float | Float[np.ndarray, "time dof"], rate: float
+) -> Float[np.ndarray, "*time dof"]:
     """Noise of the velocity [rad/s] from that of q [rad], white up to the cutoff."""
     return 2 * np.pi * noise * np.sqrt(2 * cutoff**3 / (3 * rate))

@@ -19,7 +19,7 @@ from ..arms.export import ExportResult, panda_mjcf, write_parameters
 from ..arms.mjcf import MjcfSource, move_standard
 from ..arms.source import from_document, from_mjcf
 from ..corrected import Corrected
-from ..diagnosis.traces import prepare as prepare_trace
+from ..diagnosis.traces import trajectory
 from ..effects import AbstractJointEffect, Stretches, joint_columns
 from ..errors import InputError
 from ..files import Kind, finite, output_folder, settle, write_json, write_npz
@@ -156,7 +156,7 @@ class Ensemble:
     def _diagnosed(self, motion: Recording, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = self.corrected
         assert found is not None
-        trace = prepare_trace(motion, self.arm, whole=True, noise=self.noise)
+        trace = trajectory(motion).trace(self.arm)
         shown = found.measured_torque(trace.motion, trace.channels, trace.sign)
         change = (self.standard[chosen] - np.asarray(self.arm.standard)).reshape(len(chosen), -1)
         tau = trace.motion.torque + np.einsum("tjp,mp->mtj", trace.motion.regressor, change, optimize=True)
