@@ -34,7 +34,8 @@ _BLEND = 0.05
 _BANDS = (0.15, 0.25), (0.25, 0.35), (0.35, 0.5)
 """Shares of the rate between which there is noise of q and hardly a motion."""
 _STEEPER = 1.5
-"""Ratio of the noise in the first of these bands to that in the last from which on it is not white alone."""
+"""Ratio of the noise in the first of these bands to that in the second from which on it is not white alone: what
+rows off the grid lose of it by interpolation they lose in the last."""
 _SPECTRUM = 4.0
 """Of a stretch whose spectrum is taken [s]."""
 _SMOOTH = 3.0
@@ -125,7 +126,7 @@ def _levels(q: Float[np.ndarray, " time"], rate: float) -> tuple[float, float]:
     levels, f = power[1:] * over**2, f[1:]
     bands = [band for low, high in _BANDS if (band := (f > low * rate) & (f <= high * rate)).any()]
     white = np.array([np.median(levels[band]) for band in bands])
-    if len(bands) < len(_BANDS) or white[0] < _STEEPER * white[-1]:
+    if len(bands) < len(_BANDS) or white[0] < _STEEPER * white[1]:
         return float(np.max(white)), 0.0
     jumps = np.min(np.diff(white) / np.diff([np.mean(over[band]) for band in bands]))
     jumps = max(0.0, float(jumps))
