@@ -16,7 +16,7 @@ from jaxpanda.effects import Turn
 from jaxpanda.effects.drive import Armature
 from jaxpanda.effects.friction import ViscousFriction
 
-NOISE = np.full(7, 0.02)
+NOISE, JUDGED = np.full(7, 0.02), [True] * 7
 
 
 SPEED, BRISTLES = Turn("speed", 0.01), Turn("distance", 1.5e-3)
@@ -58,11 +58,13 @@ def test_friction_of_the_model_turns_in_predictions_as_it_did_in_the_recordings(
     zeros = jnp.zeros(7)
     corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
     recording = rubbing(arm, turns)
-    found = as_recorded([recording], corrected)
+    found = as_recorded([recording], corrected, JUDGED)
     assert found.turns == turns
     assert Corrected.from_json(found.to_json()).turns == turns
     error = predicted(trajectory(recording), found)[1] - recording.tau
     assert np.all(np.std(error, axis=0) < 1.1 * NOISE)
+    unheard = as_recorded([recording], corrected, [False, *JUDGED[1:]])
+    assert unheard.turns == ((None, *turns[1:]) if turns else ())
 
 
 def test_a_speed_over_which_friction_turns_in_all_joints_is_still_read():
@@ -93,7 +95,7 @@ def test_prediction_takes_no_more_of_fast_motion_than_the_torque_showed():
     arm = Arm.panda()
     zeros = jnp.zeros(7)
     plain = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
-    found = as_recorded([reversing(arm, (1, 3), 6.0)], plain)
+    found = as_recorded([reversing(arm, (1, 3), 6.0)], plain, JUDGED)
     assert [cutoff is not None for cutoff in found.cutoffs] == [j in (1, 3) for j in range(7)]
     assert Corrected.from_json(found.to_json()).cutoffs == found.cutoffs
     faster = reversing(arm, (1, 3), 8.0)
@@ -110,9 +112,9 @@ def test_of_a_long_recording_the_beginning_is_compared(monkeypatch):
     later = rubbing(dataclasses.replace(arm, frictionloss=jnp.full(7, 5.0)), ())
     half = len(first.time) // 2
     both = dataclasses.replace(first, tau=np.concatenate([first.tau[:half], later.tau[half:]]))
-    assert as_recorded([both], corrected).turns != (SPEED,) * 7
+    assert as_recorded([both], corrected, JUDGED).turns != (SPEED,) * 7
     monkeypatch.setattr("jaxpanda.diagnosis.as_recorded.LONG", float(first.time[half - 1]))
-    assert as_recorded([both], corrected).turns == (SPEED,) * 7
+    assert as_recorded([both], corrected, JUDGED).turns == (SPEED,) * 7
 
 
 def test_torque_of_changed_links_is_that_of_the_regressor():

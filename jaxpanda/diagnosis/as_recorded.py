@@ -27,25 +27,30 @@ MOST = 0.5
 """Of the squared error of predictions, what must be motion that the torque does not show."""
 
 
-def as_recorded(recordings: Sequence[Recording], corrected: Corrected) -> Corrected:
-    """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings."""
+def as_recorded(recordings: Sequence[Recording], corrected: Corrected, judged: Sequence[bool]) -> Corrected:
+    """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings.
+
+    Joints whose torque was not `judged` stay as they are: there friction at rest may have carried any load.
+    """
     moved = [trajectory(_beginning(recording)) for recording in recordings]
-    best = dataclasses.replace(corrected, turns=_turns(moved, corrected))
+    best = dataclasses.replace(corrected, turns=_turns(moved, corrected, judged))
     each = [dataclasses.replace(best, cutoffs=(cutoff,) * corrected.arm.dof) for cutoff in CUTOFFS]
     slower = [_squares(moved, one) for one in each]
     # a smaller share may be noise of q, and another motion faster
-    filtered = np.min(slower, 0) < MOST * _squares(moved, best)
+    filtered = (np.min(slower, 0) < MOST * _squares(moved, best)) & np.asarray(judged)
     cutoffs = [CUTOFFS[k] if low else None for k, low in zip(np.argmin(slower, 0), filtered, strict=True)]
     return dataclasses.replace(best, cutoffs=tuple(cutoffs) if any(filtered) else ())
 
 
-def _turns(moved: Sequence[Trajectory], corrected: Corrected) -> tuple[Turn | None, ...]:
+def _turns(
+    moved: Sequence[Trajectory], corrected: Corrected, judged: Sequence[bool]
+) -> tuple[Turn | None, ...]:
     """How the friction of each joint turned."""
     if not np.any(np.asarray(corrected.arm.frictionloss + corrected.frictionloss_change)):
         return ()
     ways = (None, *TURNS)
     each = [dataclasses.replace(corrected, turns=(way,) * corrected.arm.dof) for way in ways]
-    nearest = np.argmin([_squares(moved, one) for one in each], 0)
+    nearest = np.argmin([_squares(moved, one) for one in each], 0) * np.asarray(judged)
     return tuple(ways[k] for k in nearest) if any(nearest) else ()
 
 

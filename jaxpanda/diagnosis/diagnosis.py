@@ -220,7 +220,7 @@ def sought(
             "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
             f" or with all of the motion: {', '.join(sorted(dropped))}"
         )
-    corrected = as_recorded(recordings, buildable(source, corrected, problem))
+    corrected = as_recorded(recordings, buildable(source, corrected, problem), _judged(problem))
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     made = Diagnosis(
         verdict=answer,
