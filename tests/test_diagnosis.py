@@ -28,10 +28,11 @@ from jaxpanda.diagnosis.decide import titles
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check, inertial_spread
 from jaxpanda.diagnosis.noise import autoregression, moments
+from jaxpanda.diagnosis.posterior import posterior_of
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
 from jaxpanda.diagnosis.search import exchange, instead, transferable
-from jaxpanda.diagnosis.state import with_terms
+from jaxpanda.diagnosis.state import torque, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.diagnosis.written import buildable, corrected_document, worsened
 from jaxpanda.effects import Motion
@@ -101,6 +102,25 @@ def test_prediction_from_the_saved_folder_reproduces_a_motion_never_seen(found, 
     error = np.sqrt(np.mean((tau - other.tau) ** 2, 0))
     assert tau.shape == other.tau.shape
     np.testing.assert_allclose(error, NOISE, rtol=0.1)
+
+
+def test_members_of_an_ensemble_differ_by_what_the_model_lacks(found):
+    """A law has taken in some of what goes along with it: half of 0.3 N m, of so much of its own torque."""
+    noise = np.asarray(found.fit.noise_floor)
+    (finding,) = found.findings
+    joint = int(np.argmax(finding.rms_torque))
+    lacking = np.where(np.arange(7) == joint, 0.3, 0.0)
+    other = lambda missed: dataclasses.replace(
+        found, fit=dataclasses.replace(found.fit, held_out_rmse_after=np.hypot(noise, missed))
+    )
+    plain, wider = (posterior_of(other(missed)) for missed in (0 * lacking, lacking))
+    more = np.sqrt(np.diag(wider.covariance) - np.diag(plain.covariance))
+    laws = [np.concatenate(torque(found.kept, i))[:, joint] for i in range(len(plain.names))]
+    size = np.array([np.sqrt(np.mean(law**2)) for law in laws])
+    share = more[-len(laws) :] / np.abs(plain.mean[-len(laws) :])
+    assert all(name.startswith("effect_") for name in plain.names)
+    np.testing.assert_allclose(share, 0.5 * 0.3 / size, rtol=0.05)
+    np.testing.assert_allclose(more[: -len(laws)], 0, atol=1e-9)
 
 
 def test_the_heat_map_is_hottest_where_the_effect_was_concealed(found):

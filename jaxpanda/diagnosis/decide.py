@@ -16,8 +16,8 @@ from .calibration import SUREST
 from .finding import Finding, joined
 from .problem import Problem, Term
 from .search import posterior
-from .state import State, foretelling, leftover, places, without
-from .uncertainty import covariances, leaning
+from .state import State, coefficients, foretelling, leftover, torque, without
+from .uncertainty import covariances, leaned
 from .unnamed import hum, standing_off, stuck
 
 LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05
@@ -59,9 +59,10 @@ def findings(
     groups = together(problem, state.terms)
     names = titles(state.terms)
     doubt = np.where(lost, MISLEADS, 1.0)
+    more = leaned(laws, missed + np.zeros(problem.dof))
     spread = [
-        _beside(problem, laws, i, covariance, missed + np.zeros(problem.dof))
-        for i, covariance in enumerate(covariances(problem, state))
+        covariance + np.diag(np.pad(off, (0, len(covariance) - len(off))) ** 2)
+        for covariance, off in zip(covariances(problem, state), more, strict=True)
     ]
     helps = foretold(problem, laws, groups)
     out = [
@@ -187,33 +188,6 @@ def _rivals(problem: Problem, searched: State, state: State, i: int) -> tuple[fl
     evidence = state.design.log_evidence - without(state, i).log_evidence
     probability = posterior(problem, searched, i)
     return evidence, probability, probability.get(state.terms[i].effect.title, 0.0)
-
-
-def coefficients(state: State, i: int) -> Float[np.ndarray, " n"]:
-    """Those of a term."""
-    return state.design.x[places(state)[i]]
-
-
-def torque(state: State, *members: int) -> list[Float[np.ndarray, "_time dof"]]:
-    """Torque of terms together in each recording [N m]."""
-    parts = [[columns @ coefficients(state, i) for columns in state.terms[i].columns] for i in members]
-    return [np.sum(of_one, 0) for of_one in zip(*parts, strict=True)]
-
-
-def _beside(
-    problem: Problem,
-    state: State,
-    i: int,
-    covariance: Float[np.ndarray, "n n"],
-    missed: Float[np.ndarray, " dof"],
-) -> Float[np.ndarray, "n n"]:
-    """Covariance of a term's numbers, what its coefficients may be off by for torque that is lacking with it."""
-    c = coefficients(state, i)
-    law = np.concatenate(torque(state, i))
-    rms = np.sqrt(np.mean(law[np.any(law != 0, axis=1)] ** 2, 0)) if np.any(law) else np.zeros(problem.dof)
-    off = np.zeros(len(covariance))
-    off[: len(c)] = leaning(rms, missed, state.noise.std) * c
-    return covariance + np.diag(off**2)
 
 
 def _finding(

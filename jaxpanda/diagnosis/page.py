@@ -14,10 +14,10 @@ from ..arms.arm import Arm
 from ..effects import AbstractEffect
 from ..report import Figure, Listing, Section, Table, number
 from ..versions import version
-from .decide import coefficients
 from .diagnosis import NEXT_MOTION, Diagnosis
 from .finding import Finding
 from .localise import REGIMES, Localisation, lag_profile, order_spectrum, since_reversal
+from .state import coefficients
 from .two_sided import TwoSided
 from .unnamed import sines
 

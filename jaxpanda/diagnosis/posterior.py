@@ -11,7 +11,7 @@ from ..feasible.nearest import are_buildable
 from ..posterior import Posterior
 from . import knowledge as knowledge_
 from .state import places
-from .uncertainty import joint
+from .uncertainty import joint, leaned
 
 if TYPE_CHECKING:
     from .diagnosis import Diagnosis
@@ -51,6 +51,8 @@ def posterior_of(found: "Diagnosis") -> Posterior:
             least.append(-np.inf)
     scale = np.array(scale)
     covariance = C[np.ix_(at, at)] * np.outer(scale, scale)
+    off = np.concatenate([np.zeros(0), *leaned(kept, found.fit.missed)])
+    covariance += np.diag(np.pad(off, (len(at) - len(off), 0)) ** 2)
     mean = x[at] * scale
     if inertial:
         K = np.linalg.pinv(found.spread)

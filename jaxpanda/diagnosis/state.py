@@ -245,6 +245,17 @@ def likelier(a: tuple[Problem, State], b: tuple[Problem, State]) -> float:
     return b[1].score - a[1].score + foretelling(left, other)
 
 
+def coefficients(state: State, i: int) -> Float[np.ndarray, " n"]:
+    """Those of a term."""
+    return state.design.x[places(state)[i]]
+
+
+def torque(state: State, *members: int) -> list[Float[np.ndarray, "_time dof"]]:
+    """Torque of terms together in each recording [N m]."""
+    parts = [[columns @ coefficients(state, i) for columns in state.terms[i].columns] for i in members]
+    return [np.sum(of_one, 0) for of_one in zip(*parts, strict=True)]
+
+
 def foretelling(left: Float[np.ndarray, "rows dof"], other: Float[np.ndarray, "rows dof"]) -> float:
     r"""By how much likelier a model is that leaves `other` than one that leaves `left` where neither was fitted.
 

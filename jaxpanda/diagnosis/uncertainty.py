@@ -28,7 +28,7 @@ from .evidence import Design
 from .noise import autoregression, moments
 from .problem import Problem, Term
 from .shapes import first_steps, moved, within
-from .state import State, places
+from .state import State, coefficients, places, torque
 
 _STEP_LOG, _STEP_SHARE, _STEP_TIME = 0.02, 0.002, 0.01
 """Steps of the differences: of a logarithm, as a share of the bounds, and of an instant [s]."""
@@ -155,6 +155,17 @@ def leaning(
     weight = np.square(law / noise)
     off = np.sqrt(np.sum(np.square(law * missed / noise**2)))
     return LEANS * float(off / np.sum(weight)) if np.any(weight) else 0.0
+
+
+def leaned(state: State, missed: Float[np.ndarray, " dof"]) -> list[Float[np.ndarray, " n"]]:
+    """What each term's coefficients may be off by for that, one standard deviation."""
+    out = []
+    for i in range(len(state.terms)):
+        law = np.concatenate(torque(state, i))
+        acts = np.any(law != 0, axis=1)
+        rms = np.sqrt(np.mean(law[acts] ** 2, 0)) if acts.any() else np.zeros(len(missed))
+        out.append(leaning(rms, missed, state.noise.std) * coefficients(state, i))
+    return out
 
 
 def _tangent(
