@@ -30,7 +30,7 @@ MOST = 0.5
 def as_recorded(recordings: Sequence[Recording], corrected: Corrected, judged: Sequence[bool]) -> Corrected:
     """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings.
 
-    Joints whose torque was not `judged` stay as they are: there friction at rest may have carried any load.
+    Of joints that were not `judged` their own torque tells nothing: friction at rest may have carried any load.
     """
     moved = [trajectory(_beginning(recording)) for recording in recordings]
     best = dataclasses.replace(corrected, turns=_turns(moved, corrected, judged))
@@ -45,12 +45,15 @@ def as_recorded(recordings: Sequence[Recording], corrected: Corrected, judged: S
 def _turns(
     moved: Sequence[Trajectory], corrected: Corrected, judged: Sequence[bool]
 ) -> tuple[Turn | None, ...]:
-    """How the friction of each joint turned."""
-    if not np.any(np.asarray(corrected.arm.frictionloss + corrected.frictionloss_change)):
+    """How the friction of each joint turned; where that was not judged, as in most others that rub."""
+    rubs = np.asarray(corrected.arm.frictionloss + corrected.frictionloss_change) != 0
+    if not rubs.any():
         return ()
     ways = (None, *TURNS)
     each = [dataclasses.replace(corrected, turns=(way,) * corrected.arm.dof) for way in ways]
-    nearest = np.argmin([_squares(moved, one) for one in each], 0) * np.asarray(judged)
+    nearest = np.argmin([_squares(moved, one) for one in each], 0)
+    others = nearest[rubs & judged]
+    nearest[~np.asarray(judged)] = np.argmax(np.bincount(others)) if len(others) else 0
     return tuple(ways[k] for k in nearest) if any(nearest) else ()
 
 
