@@ -1,6 +1,8 @@
 """The corrected model: the user's arm, what is now known better of it, and the effects that were missing."""
 
 import dataclasses
+import hashlib
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,11 +30,52 @@ from .effects import (
 )
 from .errors import InputError, reason
 from .inputs import read_json
+from .recordings import Recording
 
 SCHEMA = "jaxpanda.corrected/1"
 FILE, XML = "corrected.json", "corrected.xml"
 """Names that `diagnose` gives to the corrected arm and to the MJCF with what MuJoCo holds of it."""
 KIND = files.Kind("diagnose", ("diagnosis.json", FILE, XML, "report.html"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorded:
+    """When recordings were made, by the one clock that they share, and which they are."""
+
+    start: float
+    stop: float
+    """[s]"""
+    digests: tuple[str, ...]
+    """Of their positions."""
+
+    @classmethod
+    def of(cls, recordings: Sequence[Recording]) -> "Recorded | None":
+        """None where two were made at once by their clocks: each began anew."""
+        spans = sorted((float(r.time[0]), float(r.time[-1])) for r in recordings)
+        if any(later[0] < first[1] for first, later in itertools.pairwise(spans)):
+            return None
+        return cls(spans[0][0], spans[-1][1], tuple(_digest(r) for r in recordings))
+
+    def after(self, motion: Recording) -> Recording:
+        """The motion; where it is another one and yet has the recordings' time, its clock is one of its own, and
+        it is taken to begin when they ended."""
+        at_once = motion.time[0] < self.stop and motion.time[-1] > self.start
+        if not at_once or _digest(motion) in self.digests:
+            return motion
+        return dataclasses.replace(motion, time=motion.time - motion.time[0] + self.stop)
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any] | None) -> "Recorded | None":
+        if document is None:
+            return None
+        start, stop = float(document["start"]), float(document["stop"])
+        if not (np.isfinite([start, stop]).all() and start < stop):
+            raise ValueError("recorded must have a start before its stop")
+        return cls(start, stop, tuple(str(x) for x in document["digests"]))
+
+
+def _digest(recording: Recording) -> str:
+    return hashlib.sha256(np.ascontiguousarray(recording.q, float).tobytes()).hexdigest()
 
 
 class Corrected(eqx.Module):
@@ -54,6 +97,8 @@ class Corrected(eqx.Module):
     cutoffs: tuple[float | None, ...] = eqx.field(default=(), static=True)
     """Up to which a prediction takes motion into account in each joint's torque [Hz], as that of the recordings
     showed it; None, or no entries: as far as q shows it."""
+    recorded: Recorded | None = eqx.field(default=None, static=True)
+    """The recordings that told all this, for what changes with time; None where each began anew."""
 
     @property
     def native(self) -> Arm:
@@ -210,6 +255,7 @@ class Corrected(eqx.Module):
             "frictionloss_change": np.asarray(self.frictionloss_change).tolist(),
             "turns": [None if turn is None else {turn.over: turn.size} for turn in self.turns],
             "cutoffs": list(self.cutoffs),
+            "recorded": None if self.recorded is None else dataclasses.asdict(self.recorded),
             "effects": [
                 {**effect.to_json(), "coefficients": np.asarray(c).tolist()}
                 for effect, c in zip(self.effects, self.coefficients, strict=True)
@@ -241,6 +287,7 @@ class Corrected(eqx.Module):
             tuple(numbers(e["coefficients"]) for e in document["effects"]),
             _turns(document),
             tuple(None if x is None else float(x) for x in document.get("cutoffs") or ()),
+            Recorded.from_json(document.get("recorded")),
         )
 
 

@@ -9,12 +9,13 @@ import pytest
 import scipy.signal
 
 from jaxpanda import Arm, Recording
-from jaxpanda.corrected import Corrected
+from jaxpanda.corrected import Corrected, Recorded
 from jaxpanda.diagnosis.as_recorded import as_recorded, misleading, predicted
 from jaxpanda.diagnosis.traces import held_sign, prepare, trajectory
 from jaxpanda.effects import Turn
 from jaxpanda.effects.drive import Armature
 from jaxpanda.effects.friction import ViscousFriction
+from jaxpanda.effects.sensing import TorqueDrift
 
 NOISE, JUDGED = np.full(7, 0.02), [True] * 7
 
@@ -141,3 +142,30 @@ def test_effects_that_make_the_recordings_own_torque_worse_are_named():
     assert misleading([recording], wrong, 8) == {7}
     assert misleading([recording], wrong, 1) == {0}
     assert misleading([recording], lacking, 0) == set()
+
+
+def test_a_motion_whose_clock_is_its_own_comes_after_the_recordings():
+    """A drift that had settled began anew with it; a motion by the recordings' clock keeps its time."""
+    first = rubbing(Arm.panda(), ())
+    at = lambda start, q=first.q: dataclasses.replace(first, time=first.time + start, q=q)
+    recorded = Recorded.of([at(0.0), at(20.0)])
+    assert (recorded.start, recorded.stop) == (0.0, 20.0 + first.time[-1])
+    assert Recorded.from_json(dataclasses.asdict(recorded)) == recorded
+    other = first.q + 1e-3
+    np.testing.assert_allclose(recorded.after(at(5.0, other)).time, first.time + recorded.stop)
+    for own in (at(20.0), at(40.0, other), at(-9.0, other)):
+        assert recorded.after(own) is own
+    assert Recorded.of([at(0.0), at(3.0)]) is None
+
+
+def test_a_drift_goes_on_from_what_it_had_come_to(tmp_path):
+    arm, zeros = Arm.panda(), jnp.zeros(7)
+    recording = rubbing(arm, ())
+    drift = TorqueDrift(2, 1.0, "extra").beyond([prepare(recording, arm).channels])
+    found = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (drift,), (jnp.array([2.0]),))
+    later = as_recorded([recording], found, JUDGED)
+    plain = dataclasses.replace(later, effects=(), coefficients=())
+    for one, sample, level in ((recording, 0, 0.0), (rubbing(arm, (SPEED,) * 7), 0, 2.0)):
+        own = dataclasses.replace(one, q=one.q + (0.0 if level == 0 else 1e-3))
+        shown = [predicted(trajectory(later.recorded.after(own)), by)[1] for by in (later, plain)]
+        assert (shown[0] - shown[1])[sample, 2] == pytest.approx(level, abs=0.01)

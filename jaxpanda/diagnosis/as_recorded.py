@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..corrected import Corrected
+from ..corrected import Corrected, Recorded
 from ..effects import Turn
 from ..recordings import Recording
 from .traces import Trace, Trajectory, trajectory
@@ -39,7 +39,9 @@ def as_recorded(recordings: Sequence[Recording], corrected: Corrected, judged: S
     # a smaller share may be noise of q, and another motion faster
     filtered = (np.min(slower, 0) < MOST * _squares(moved, best)) & np.asarray(judged)
     cutoffs = [CUTOFFS[k] if low else None for k, low in zip(np.argmin(slower, 0), filtered, strict=True)]
-    return dataclasses.replace(best, cutoffs=tuple(cutoffs) if any(filtered) else ())
+    return dataclasses.replace(
+        best, cutoffs=tuple(cutoffs) if any(filtered) else (), recorded=Recorded.of(recordings)
+    )
 
 
 def _turns(

@@ -176,6 +176,8 @@ def predict_sides(
     sides = read_sides(folder, effects)
     corrected, _ = sides[0] if sides else read(folder, effects)
     recording.require_dof(corrected.arm.dof)
+    if corrected.recorded is not None:
+        recording = corrected.recorded.after(recording)
     trace, torque = predicted(trajectory(recording.of_link_side()), corrected)
     tau = at_rows(recording, trace.motion.time, torque)
     if not sides:

@@ -156,7 +156,8 @@ class Ensemble:
     def _diagnosed(self, motion: Recording, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = self.corrected
         assert found is not None
-        trace = trajectory(motion).trace(self.arm)
+        later = motion if found.recorded is None else found.recorded.after(motion)
+        trace = trajectory(later).trace(self.arm)
         shown = found.measured_torque(trace.motion, trace.channels, trace.sign)
         change = (self.standard[chosen] - np.asarray(self.arm.standard)).reshape(len(chosen), -1)
         tau = trace.motion.torque + np.einsum("tjp,mp->mtj", trace.motion.regressor, change, optimize=True)
@@ -177,7 +178,7 @@ class Ensemble:
                 tau[:, :, effect.joints[0]] += c @ columns.T
             else:
                 tau += np.einsum("tjk,mk->mtj", effect.over(trace.motion), c)  # pyright: ignore
-        return trace.motion.time, tau
+        return trace.motion.time - later.time[0] + motion.time[0], tau
 
     def _is_drawn_rotor(self, i: int) -> bool:
         """Whether an effect of `corrected` is a rotor of the model, which members have as `armature`."""
