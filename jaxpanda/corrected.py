@@ -133,6 +133,19 @@ class Corrected(eqx.Module):
             (chain, standard, *(values[n] for n in names)),
         )
 
+    def before(self, motion: Recording) -> tuple["Corrected", Recording]:
+        """The arm as it meets a motion, and the motion by the recordings' clock.
+
+        Where its clock is one of its own (`Recorded.after`), what drifts in the plant has come to what it was at
+        the end of the recordings; a sensor may have been tared since, and its drift is left out.
+        """
+        later = motion if self.recorded is None else self.recorded.after(motion)
+        if later is motion:
+            return self, motion
+        kept = [i for i, effect in enumerate(self.effects) if not effect.passes]
+        effects, coefficients = (tuple(x[i] for i in kept) for x in (self.effects, self.coefficients))
+        return dataclasses.replace(self, effects=effects, coefficients=coefficients), later
+
     @property
     def as_written(self) -> "Corrected":
         """The same effects on the user's own numbers."""

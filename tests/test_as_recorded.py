@@ -14,7 +14,7 @@ from jaxpanda.diagnosis.as_recorded import as_recorded, misleading, predicted
 from jaxpanda.diagnosis.traces import held_sign, prepare, trajectory
 from jaxpanda.effects import Turn
 from jaxpanda.effects.drive import Armature
-from jaxpanda.effects.friction import ViscousFriction
+from jaxpanda.effects.friction import FrictionDrift, ViscousFriction
 from jaxpanda.effects.sensing import TorqueDrift
 
 NOISE, JUDGED = np.full(7, 0.02), [True] * 7
@@ -158,14 +158,22 @@ def test_a_motion_whose_clock_is_its_own_comes_after_the_recordings():
     assert Recorded.of([at(0.0), at(3.0)]) is None
 
 
-def test_a_drift_goes_on_from_what_it_had_come_to(tmp_path):
+def test_friction_goes_on_from_what_it_had_come_to_and_a_sensor_is_tared():
+    """In a motion with a clock of its own; the recording itself is predicted by its own time."""
     arm, zeros = Arm.panda(), jnp.zeros(7)
     recording = rubbing(arm, ())
-    drift = TorqueDrift(2, 1.0, "extra").beyond([prepare(recording, arm).channels])
-    found = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (drift,), (jnp.array([2.0]),))
-    later = as_recorded([recording], found, JUDGED)
-    plain = dataclasses.replace(later, effects=(), coefficients=())
-    for one, sample, level in ((recording, 0, 0.0), (rubbing(arm, (SPEED,) * 7), 0, 2.0)):
-        own = dataclasses.replace(one, q=one.q + (0.0 if level == 0 else 1e-3))
-        shown = [predicted(trajectory(later.recorded.after(own)), by)[1] for by in (later, plain)]
-        assert (shown[0] - shown[1])[sample, 2] == pytest.approx(level, abs=0.01)
+    channels = [prepare(recording, arm).channels]
+    bias = TorqueDrift(2, 1.0, "extra").beyond(channels)
+    warmth = FrictionDrift(0, 1.0, 0.001, "level extra").beyond(channels)
+    drifting = (bias, warmth), (jnp.array([2.0]), jnp.array([3.0]))
+    found = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, *drifting)
+    found = as_recorded([recording], found, JUDGED)
+    plain = dataclasses.replace(found, effects=(), coefficients=())
+    for q, sensor, friction in ((recording.q, 0.0, 0.0), (recording.q + 1e-3, 0.0, 3.0)):
+        arms = [one.before(dataclasses.replace(recording, q=q)) for one in (found, plain)]
+        shown = [predicted(trajectory(motion), one)[1] for one, motion in arms]
+        changed = (shown[0] - shown[1])[1]
+        assert changed[2] == pytest.approx(sensor, abs=0.02)
+        assert changed[0] == pytest.approx(friction, abs=0.05)
+    end = predicted(trajectory(recording), found)[1] - predicted(trajectory(recording), plain)[1]
+    assert end[-1, 2] == pytest.approx(2.0, abs=0.01)

@@ -176,13 +176,13 @@ def predict_sides(
     sides = read_sides(folder, effects)
     corrected, _ = sides[0] if sides else read(folder, effects)
     recording.require_dof(corrected.arm.dof)
-    if corrected.recorded is not None:
-        recording = corrected.recorded.after(recording)
+    drives = sides[1][0].before(recording)[0] if sides else None
+    corrected, recording = corrected.before(recording)
     trace, torque = predicted(trajectory(recording.of_link_side()), corrected)
     tau = at_rows(recording, trace.motion.time, torque)
-    if not sides:
+    if drives is None:
         return tau, None
     passed = passed_on(corrected, recording, tau)
     view = dataclasses.replace(recording, tau=None, tau_motor=None, transmitted=passed)
-    trace, torque = predicted(trajectory(view), sides[1][0])
+    trace, torque = predicted(trajectory(view), drives)
     return tau, at_rows(recording, trace.motion.time, torque)

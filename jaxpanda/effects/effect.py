@@ -141,6 +141,11 @@ class AbstractEffect(eqx.Module):
     def equation(self) -> str:
         """Readable equation in the symbols of the parameters."""
 
+    @property
+    def passes(self) -> bool:
+        """Whether it is over with the session in which it was recorded: a drift of a sensor."""
+        return self.drifts and self.acts_on == "torque"
+
     def beyond(self, recorded: Sequence[Channels]) -> "AbstractEffect":
         """The same where it was recorded, and as it may go on beyond that."""
         return self

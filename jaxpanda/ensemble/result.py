@@ -156,9 +156,9 @@ class Ensemble:
     def _diagnosed(self, motion: Recording, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = self.corrected
         assert found is not None
-        later = motion if found.recorded is None else found.recorded.after(motion)
+        arm, later = found.before(motion)
         trace = trajectory(later).trace(self.arm)
-        shown = found.measured_torque(trace.motion, trace.channels, trace.sign)
+        shown = arm.measured_torque(trace.motion, trace.channels, trace.sign)
         change = (self.standard[chosen] - np.asarray(self.arm.standard)).reshape(len(chosen), -1)
         tau = trace.motion.torque + np.einsum("tjp,mp->mtj", trace.motion.regressor, change, optimize=True)
         tau += trace.motion.qd * self.own("viscous")[chosen][:, None]
@@ -170,7 +170,8 @@ class Ensemble:
         }
         for i, (bound, mean) in enumerate(zip(found.effects, found.coefficients, strict=True)):
             effect = bound.placed("", later=True)
-            if effect is None or self._is_drawn_rotor(i):
+            over = bound.passes and later is not motion
+            if effect is None or over or self._is_drawn_rotor(i):
                 continue
             c = self._coefficients(i, np.asarray(mean))[chosen]
             if isinstance(effect, AbstractJointEffect):
