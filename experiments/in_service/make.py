@@ -221,6 +221,7 @@ def make(job: tuple) -> str:
         write(folder / f"{name}.csv", r["t"], r["q"], r["dq"], r["tau"])
         if name == "heldout":
             write(folder / "heldout_motion.csv", r["t"], r["q"], r["dq"], None)
+            np.savez_compressed(folder / "hidden.npz", heldout_motion=np.stack(r["states"]))
     (folder / "truth.json").write_text(json.dumps(answers(case, seed, kind), indent=1, ensure_ascii=False))
     return folder.name
 

@@ -234,8 +234,9 @@ def make_case(job: tuple[int, int, str, str, str]) -> str:
         recording.write(folder / f"train_{k}.csv", torque=True)
     held.write(folder / "heldout_motion.csv", torque=False)
     held.write(folder / "heldout.csv", torque=True)
-    # what the clean column has beyond the file's dynamics without dry friction, for check.py
-    np.savez_compressed(folder / "hidden.npz", train_0=trains[0].extra + trains[0].dry)
+    # what the clean column has beyond the file's dynamics without dry friction, for check.py; and the true motion
+    beyond, moved = trains[0].extra + trains[0].dry, np.stack(held.clean)
+    np.savez_compressed(folder / "hidden.npz", train_0=beyond, heldout_motion=moved)
     truth = truth_of(d, kind, detail, family, trains, held)
     (folder / "truth.json").write_text(json.dumps(truth, indent=1))
     return f"{folder.name} {kind} {detail} {d.user.name} {family} {d.sensors.fs} Hz {d.seconds:.0f} s"
