@@ -11,6 +11,7 @@ like this one, rounded to the same steps in several places of a step.
 """
 
 import dataclasses
+import functools
 
 import numpy as np
 import scipy.ndimage
@@ -44,8 +45,11 @@ _DITHERED = 0.5
 """Noise, in steps of an encoder, from which on its rounding is white."""
 _PLACES = 8
 """Places in a step from which rounding is made again."""
-_CONTINUED = 0.3
-"""At the ends of a recording, over which q is fitted to continue it [s]."""
+_FITTED, _CONTINUED = (0.3, 1.2), (0.2, 0.7)
+"""At the ends of a recording q is fitted over so long, and continued by so much: at least [s], and in periods of
+the low-pass. With less, noise at the ends of slow low-passes is hundreds of times that within."""
+_DRAWN = 64
+"""Recordings of noise that tell how much there is at the ends."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +86,10 @@ def _smooth_joint(
     each = np.stack([continued_derivatives(q[:, None], cutoff, rate) for cutoff in cutoffs])[..., 0]
     qdd = each[:, 2]
     reach = _AGREE * _noise(q, step, cutoffs, rate)
+    for row, cutoff in zip(reach, cutoffs, strict=True):
+        more = _at_ends(float(cutoff), rate)[: len(q)]
+        row[: len(more)] *= more
+        row[len(row) - len(more) :] *= more[::-1]
     low, high = np.maximum.accumulate(qdd - reach, 0), np.minimum.accumulate(qdd + reach, 0)
     lowest = np.sum(np.logical_and.accumulate(low <= high, 0), 0) - 1.0
     lowest = scipy.ndimage.minimum_filter1d(lowest, _samples(2 * _BLEND, rate))
@@ -150,16 +158,26 @@ def continued_derivatives(
     q: Float[np.ndarray, "time dof"], cutoff: float, rate: float
 ) -> tuple[Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"], Float[np.ndarray, "time dof"]]:
     """`signals.derivatives`, with q continued beyond its ends by quartics: an arm may be cut off in motion."""
-    count = min(max(8, round(_CONTINUED * rate)), len(q))
-    more = max(4, round(0.2 * rate))
+    fitted, continued = (round(max(least, of / cutoff) * rate) for least, of in (_FITTED, _CONTINUED))
+    count, more = min(max(8, fitted), len(q)), max(4, continued)
     x = np.arange(count) / rate
     ends = []
     for part, at in (
         (q[:count], -np.arange(more, 0, -1) / rate),
         (q[-count:], x[-1] + np.arange(1, more + 1) / rate),
     ):
-        fitted = np.polynomial.polynomial.polyfit(x, part, 4)
-        ends.append(np.polynomial.polynomial.polyval(at, fitted).T)
+        quartic = np.polynomial.polynomial.polyfit(x, part, 4)
+        ends.append(np.polynomial.polynomial.polyval(at, quartic).T)
     longer = derivatives(np.concatenate([ends[0], q, ends[1]]), cutoff, rate)
     smoothed, first, second = (part[more:-more] for part in longer)
     return smoothed, first, second
+
+
+@functools.lru_cache(maxsize=64)
+def _at_ends(cutoff: float, rate: float) -> Float[np.ndarray, " time"]:
+    """How much more noise there is in the acceleration at each sample from an end than within, 1 or more."""
+    reach = max(16, round(rate / cutoff))
+    noise = np.random.default_rng(0).standard_normal((4 * reach, _DRAWN))
+    square = np.mean(continued_derivatives(noise, cutoff, rate)[2] ** 2, 1)
+    ends = 0.5 * (square[:reach] + square[: -reach - 1 : -1])
+    return np.maximum(np.sqrt(ends / np.mean(square[reach:-reach])), 1.0)
