@@ -133,7 +133,7 @@ class Corrected(eqx.Module):
             (chain, standard, *(values[n] for n in names)),
         )
 
-    def before(self, motion: Recording) -> tuple["Corrected", Recording]:
+    def for_motion(self, motion: Recording) -> tuple["Corrected", Recording]:
         """The arm as it meets a motion, and the motion by the recordings' clock.
 
         Where its clock is one of its own (`Recorded.after`), what drifts in the plant has come to what it was at

@@ -59,13 +59,13 @@ def test_friction_of_the_model_turns_in_predictions_as_it_did_in_the_recordings(
     zeros = jnp.zeros(7)
     corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
     recording = rubbing(arm, turns)
-    found = as_recorded([recording], corrected, JUDGED)
+    found = as_recorded([trajectory(recording)], corrected, JUDGED)
     assert found.turns == turns
     assert Corrected.from_json(found.to_json()).turns == turns
     error = predicted(trajectory(recording), found)[1] - recording.tau
     assert np.all(np.std(error, axis=0) < 1.1 * NOISE)
     others = (*turns[:1], *turns[2:])
-    unheard = as_recorded([recording], corrected, [j != 1 for j in range(7)]).turns
+    unheard = as_recorded([trajectory(recording)], corrected, [j != 1 for j in range(7)]).turns
     assert unheard == ((turns[0], max(others, key=others.count), *turns[2:]) if turns else ())
 
 
@@ -97,7 +97,7 @@ def test_prediction_takes_no_more_of_fast_motion_than_the_torque_showed():
     arm = Arm.panda()
     zeros = jnp.zeros(7)
     plain = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
-    found = as_recorded([reversing(arm, (1, 3), 6.0)], plain, JUDGED)
+    found = as_recorded([trajectory(reversing(arm, (1, 3), 6.0))], plain, JUDGED)
     assert [cutoff is not None for cutoff in found.cutoffs] == [j in (1, 3) for j in range(7)]
     assert Corrected.from_json(found.to_json()).cutoffs == found.cutoffs
     faster = reversing(arm, (1, 3), 8.0)
@@ -114,9 +114,9 @@ def test_of_a_long_recording_the_beginning_is_compared(monkeypatch):
     later = rubbing(dataclasses.replace(arm, frictionloss=jnp.full(7, 5.0)), ())
     half = len(first.time) // 2
     both = dataclasses.replace(first, tau=np.concatenate([first.tau[:half], later.tau[half:]]))
-    assert as_recorded([both], corrected, JUDGED).turns != (SPEED,) * 7
+    assert as_recorded([trajectory(both)], corrected, JUDGED).turns != (SPEED,) * 7
     monkeypatch.setattr("jaxpanda.diagnosis.as_recorded.LONG", float(first.time[half - 1]))
-    assert as_recorded([both], corrected, JUDGED).turns == (SPEED,) * 7
+    assert as_recorded([trajectory(both)], corrected, JUDGED).turns == (SPEED,) * 7
 
 
 def test_torque_of_changed_links_is_that_of_the_regressor():
@@ -133,15 +133,15 @@ def test_effects_that_make_the_recordings_own_torque_worse_are_named():
     lacking = Corrected(Arm.panda(), jnp.zeros((7, 10)), zeros, zeros, (), ())
     damped = tuple(ViscousFriction(j) for j in range(7)), (jnp.array([0.5]),) * 7
     right = dataclasses.replace(lacking, effects=damped[0], coefficients=damped[1])
-    assert misleading([recording], right, 7) == set()
+    assert misleading([trajectory(recording)], right, 7) == set()
     wrong = dataclasses.replace(
         right,
         effects=(*damped[0], Armature(5, "signed")),
         coefficients=(*damped[1], jnp.array([0.02])),
     )
-    assert misleading([recording], wrong, 8) == {7}
-    assert misleading([recording], wrong, 1) == {0}
-    assert misleading([recording], lacking, 0) == set()
+    assert misleading([trajectory(recording)], wrong, 8) == {7}
+    assert misleading([trajectory(recording)], wrong, 1) == {0}
+    assert misleading([trajectory(recording)], lacking, 0) == set()
 
 
 def test_a_motion_whose_clock_is_its_own_comes_after_the_recordings():
@@ -167,10 +167,10 @@ def test_friction_goes_on_from_what_it_had_come_to_and_a_sensor_is_tared():
     warmth = FrictionDrift(0, 1.0, 0.001, "level extra").beyond(channels)
     drifting = (bias, warmth), (jnp.array([2.0]), jnp.array([3.0]))
     found = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, *drifting)
-    found = as_recorded([recording], found, JUDGED)
+    found = as_recorded([trajectory(recording)], found, JUDGED)
     plain = dataclasses.replace(found, effects=(), coefficients=())
     for q, sensor, friction in ((recording.q, 0.0, 0.0), (recording.q + 1e-3, 0.0, 3.0)):
-        arms = [one.before(dataclasses.replace(recording, q=q)) for one in (found, plain)]
+        arms = [one.for_motion(dataclasses.replace(recording, q=q)) for one in (found, plain)]
         shown = [predicted(trajectory(motion), one)[1] for one, motion in arms]
         changed = (shown[0] - shown[1])[1]
         assert changed[2] == pytest.approx(sensor, abs=0.02)

@@ -27,21 +27,20 @@ MOST = 0.5
 """Of the squared error of predictions, what must be motion that the torque does not show."""
 
 
-def as_recorded(recordings: Sequence[Recording], corrected: Corrected, judged: Sequence[bool]) -> Corrected:
+def as_recorded(whole: Sequence[Trajectory], corrected: Corrected, judged: Sequence[bool]) -> Corrected:
     """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings.
 
     Of joints that were not `judged` their own torque tells nothing: friction at rest may have carried any load.
     """
-    moved = [trajectory(_beginning(recording)) for recording in recordings]
+    moved = [_beginning(one) for one in whole]
     best = dataclasses.replace(corrected, turns=_turns(moved, corrected, judged))
     each = [dataclasses.replace(best, cutoffs=(cutoff,) * corrected.arm.dof) for cutoff in CUTOFFS]
     slower = [_squares(moved, one) for one in each]
     # a smaller share may be noise of q, and another motion faster
     filtered = (np.min(slower, 0) < MOST * _squares(moved, best)) & np.asarray(judged)
     cutoffs = [CUTOFFS[k] if low else None for k, low in zip(np.argmin(slower, 0), filtered, strict=True)]
-    return dataclasses.replace(
-        best, cutoffs=tuple(cutoffs) if any(filtered) else (), recorded=Recorded.of(recordings)
-    )
+    recorded = Recorded.of([one.recording for one in whole])
+    return dataclasses.replace(best, cutoffs=tuple(cutoffs) if any(filtered) else (), recorded=recorded)
 
 
 def _turns(
@@ -59,13 +58,13 @@ def _turns(
     return tuple(ways[k] for k in nearest) if any(nearest) else ()
 
 
-def misleading(recordings: Sequence[Recording], corrected: Corrected, count: int) -> set[int]:
+def misleading(whole: Sequence[Trajectory], corrected: Corrected, count: int) -> set[int]:
     """Which of the last `count` effects make the recordings' own torque be predicted worse.
 
     A search compares motion and torque below the frequency up to which both are known; a prediction shows all of
     the motion. What only fitted the slow part is no law of this arm.
     """
-    traces = [predicted(trajectory(recording), corrected)[0] for recording in recordings]
+    traces = [predicted(one, corrected)[0] for one in whole]
     counts = np.concatenate([t.weight > 0 for t in traces])
     measured = np.concatenate([np.asarray(t.tau) for t in traces])[counts]
     squares = lambda x: np.maximum(np.sum((measured - x) ** 2, 0), 1e-300)
@@ -109,12 +108,13 @@ def at_rows(
     return np.stack([np.interp(recording.time, time, column) for column in torque.T], 1)
 
 
-def _beginning(recording: Recording) -> Recording:
+def _beginning(moved: Trajectory) -> Trajectory:
     """The first `LONG` of a recording."""
+    recording = moved.recording
     count = int(np.searchsorted(recording.time, recording.time[0] + LONG, "right"))
     if count == recording.samples:
-        return recording
-    return recording.at(slice(count))
+        return moved
+    return trajectory(recording.at(slice(count)))
 
 
 def _squares(moved: Sequence[Trajectory], corrected: Corrected) -> Float[np.ndarray, " dof"]:

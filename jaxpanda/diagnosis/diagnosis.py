@@ -36,7 +36,7 @@ from .premises import Premises, settled
 from .problem import FOLDS, Problem
 from .search import transferable
 from .state import State, with_terms
-from .traces import Trace
+from .traces import Trace, trajectory
 from .uncertainty import polished
 from .unnamed import BEYOND
 from .written import buildable
@@ -195,7 +195,8 @@ def sought(
     kept = transferable(problem, laws)
     correct = lambda by: _corrected(arm, premises, by, refitted=bool(by.terms or wrong))
     corrected = correct(kept)
-    if worse := misleading(recordings, corrected, len(kept.terms)):
+    moved = [trajectory(recording) for recording in recordings]
+    if worse := misleading(moved, corrected, len(kept.terms)):
         kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
         corrected = correct(kept)
     lost = [all(t is not k for k in kept.terms) for t in laws.terms]
@@ -220,7 +221,7 @@ def sought(
             "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
             f" or with all of the motion: {', '.join(sorted(dropped))}"
         )
-    corrected = as_recorded(recordings, buildable(source, corrected, problem), _judged(problem))
+    corrected = as_recorded(moved, buildable(source, corrected, problem), _judged(problem))
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     made = Diagnosis(
         verdict=answer,

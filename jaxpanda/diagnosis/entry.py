@@ -176,8 +176,8 @@ def predict_sides(
     sides = read_sides(folder, effects)
     corrected, _ = sides[0] if sides else read(folder, effects)
     recording.require_dof(corrected.arm.dof)
-    drives = sides[1][0].before(recording)[0] if sides else None
-    corrected, recording = corrected.before(recording)
+    drives = sides[1][0].for_motion(recording)[0] if sides else None
+    corrected, recording = corrected.for_motion(recording)
     trace, torque = predicted(trajectory(recording.of_link_side()), corrected)
     tau = at_rows(recording, trace.motion.time, torque)
     if drives is None:

@@ -193,7 +193,7 @@ class Trajectory:
         motion = self.smoothed.q, self.smoothed.qd, self.smoothed.qdd
         if below < _most(rate):
             motion = tuple(signals_.zero_phase(x, below, rate) for x in motion)
-        keep = np.arange(0, len(self.signals.time), max(1, int(rate / (FINER * WORK_RATE) + 1e-6)))
+        keep = np.arange(0, len(self.signals.time), _thinnest(rate, WORK_RATE))
         return _on_grids(self.recording, self.signals, keep, motion, self.slowest, arm, turns, WORK_RATE)
 
 
@@ -213,26 +213,18 @@ def _most(rate: float) -> float:
     return min(signals_.DERIVATIVE_CUTOFF, 0.25 * rate)
 
 
-def prepare(
-    recording: Recording,
-    arm: Arm,
-    *,
-    noise: Float[np.ndarray, " dof"] | None = None,
-    coarse: float = WORK_RATE,
-) -> Trace:
+def prepare(recording: Recording, arm: Arm, *, coarse: float = WORK_RATE) -> Trace:
     """A recording on its two grids, for a diagnosis.
 
     Args:
         recording: with torque, or a motion.
         arm: whose nominal torque is to be compared; without links, where the recording says what they take.
-        noise: of the torque [N m], where the recording does not tell.
         coarse: rate of the coarse grid, at most; motion above 0.4 of it is left out, as in the torque [Hz].
     """
     rough = signals_.prepare(recording, cutoff=3.0, rate=coarse, trim=TRIM)
     rate, time, keep = rough.rate, rough.time, rough.keep
     position = _splined(recording, time)
-    if noise is None and rough.tau is not None:
-        noise = signals_.white_noise(rough.tau)
+    noise = None if rough.tau is None else signals_.white_noise(rough.tau)
     cutoff_q = min(position_cutoff(position, noise, arm, rate), _FELT * coarse)
     q, qd, qdd = continued_derivatives(position, cutoff_q, rate)
     width = _REST * _velocity_noise(_position_noise(position), cutoff_q, rate)
@@ -265,8 +257,8 @@ def _on_grids(
 ) -> Trace:
     """A motion, its derivatives and its torque on a fine grid and on the coarse one of the samples `keep`."""
     rate, time = signals.rate, signals.time
-    thinnest, stride = max(1, int(rate / (FINER * coarse) + 1e-6)), int(np.min(np.diff(keep)))
-    thin = next(k for k in range(min(stride, thinnest), 0, -1) if stride % k == 0)
+    stride = int(np.min(np.diff(keep)))
+    thin = next(k for k in range(min(stride, _thinnest(rate, coarse)), 0, -1) if stride % k == 0)
     fine = np.arange(keep[0] % thin, len(time), thin)
     kept, dt = (keep - fine[0]) // thin, thin / rate
     cutoff = min(_FELT * rate / stride, 0.45 * rate)
@@ -297,6 +289,11 @@ def _on_grids(
     weight = _weight(recording.time, time[keep], rate)
     trust = np.ones(motion.q.shape)
     return Trace(recording.name, signals, channels, dt, motion, tau, weight, kept, cutoff, sign, trust)
+
+
+def _thinnest(rate: float, coarse: float) -> int:
+    """Every how many samples the fine grid takes one, at most."""
+    return max(1, int(rate / (FINER * coarse) + 1e-6))
 
 
 def _splined(recording: Recording, time: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time dof"]:

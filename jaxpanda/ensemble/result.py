@@ -156,7 +156,7 @@ class Ensemble:
     def _diagnosed(self, motion: Recording, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = self.corrected
         assert found is not None
-        arm, later = found.before(motion)
+        arm, later = found.for_motion(motion)
         trace = trajectory(later).trace(self.arm)
         shown = arm.measured_torque(trace.motion, trace.channels, trace.sign)
         change = (self.standard[chosen] - np.asarray(self.arm.standard)).reshape(len(chosen), -1)
