@@ -94,18 +94,21 @@ def joined(processes: str) -> Iterator[Ranks]:
         return
     together = _Together(rank, count)
     try:
-        together.meet(host, port)
-        yield together
-        together.leave()
-    except KeyboardInterrupt as stop:
+        try:
+            together.meet(host, port)
+            yield together
+            together.leave()
+        except KeyboardInterrupt:
+            raise
+        except InputError as error:
+            together.fail(f"rank {rank}: {error}", 2)
+            raise
+        except BaseException as error:
+            together.fail(f"rank {rank}: {' '.join(str(error).split()) or type(error).__name__}", 1)
+            raise
+    except KeyboardInterrupt as stop:  # that of another's failure may come while an error is raised
         together.fail(f"rank {rank} was interrupted", 1)
         raise together.error(str(stop)) or stop from None
-    except InputError as error:
-        together.fail(f"rank {rank}: {error}", 2)
-        raise
-    except BaseException as error:
-        together.fail(f"rank {rank}: {' '.join(str(error).split()) or type(error).__name__}", 1)
-        raise
     finally:
         together.close()
 
@@ -199,9 +202,10 @@ class _Together(Ranks):
         self._done = threading.Event()  # at rank 0
         self._failure: tuple[str, int] | None = None
         self._lock = threading.Lock()
+        self._ending = False  # here: what an interrupt would say is known
         self._in_main = threading.current_thread() is threading.main_thread()
         if self._in_main:  # SIGINT is ignored in what a script starts in the background
-            self._handler = signal.signal(_INTERRUPT, signal.default_int_handler)
+            self._handler = signal.signal(_INTERRUPT, self._interrupted)
 
     # How they find each other
 
@@ -361,6 +365,7 @@ class _Together(Ranks):
 
     def fail(self, said: str, status: int) -> None:
         """Tell the others, unless they told it."""
+        self._ending = True
         with self._lock:
             self._ended.set()
         if self._failure is None or self.rank == 0:
@@ -376,7 +381,9 @@ class _Together(Ranks):
         return InputError(said) if status == 2 else RankError(said)
 
     def close(self) -> None:
-        self._ended.set()
+        self._ending = True
+        with self._lock:  # no interrupt is on its way any more
+            self._ended.set()
         for line in self._lines:
             line.close()
         if self._in_main:
@@ -391,10 +398,14 @@ class _Together(Ranks):
             if self._ended.is_set() or self._done.is_set() or self._failure is not None:
                 return
             self._failure = said, status
-        if not self._in_main:
-            return
-        signal.pthread_kill(threading.main_thread().ident or 0, _INTERRUPT)
-        threading.Thread(target=self._end_late, daemon=True).start()
+            if self._in_main:
+                signal.pthread_kill(threading.main_thread().ident or 0, _INTERRUPT)
+                threading.Thread(target=self._end_late, daemon=True).start()
+
+    def _interrupted(self, *_: object) -> None:
+        """In the main thread, on `_INTERRUPT`."""
+        if not self._ending:
+            raise KeyboardInterrupt
 
     def _end_late(self) -> None:
         if self._ended.wait(GRACE) or self._failure is None:

@@ -222,6 +222,35 @@ def test_an_unknown_host_is_one_sentence():
             pass
 
 
+@pytest.mark.parametrize("late", [0.0, 1.0])
+@pytest.mark.parametrize("work", ["exchanging", "computing"])
+def test_an_interrupt_says_what_the_other_rank_said_however_late_it_comes(port, monkeypatch, late, work):
+    kill = ranks.signal.pthread_kill
+    monkeypatch.setattr(ranks.signal, "pthread_kill", lambda *given: time.sleep(late) or kill(*given))
+    came: list[object] = []
+    before = ranks.signal.signal(ranks._INTERRUPT, lambda *_: came.append("too late"))
+
+    def other() -> None:
+        with contextlib.suppress(InputError), joined(f"0/2@localhost:{port}"):
+            raise InputError("the third row is empty")
+
+    first = threading.Thread(target=other)
+    first.start()
+    try:
+        with (
+            pytest.raises(InputError, match="rank 0: the third row"),
+            joined(f"1/2@localhost:{port}") as here,
+        ):
+            here.gather([np.ones(1)]) if work == "exchanging" else time.sleep(30.0)
+    except KeyboardInterrupt:  # it would end all tests
+        pytest.fail("an interrupt came through")
+    finally:
+        first.join()
+        time.sleep(late)
+        ranks.signal.signal(ranks._INTERRUPT, before)
+    assert not came
+
+
 # Whole commands
 
 PATH = Path(__file__).parents[1] / "experiments" / "hostile" / "ranks.py"
