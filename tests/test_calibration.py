@@ -49,6 +49,13 @@ def test_nothing_is_as_sure_where_something_stays_unexplained():
     assert 1 - partly > 1.5 * (1 - explained)
 
 
+def test_what_acts_for_a_while_only_is_doubted():
+    always = dataclasses.replace(found([1.0, 0.0]), parameters=({"name": "damping", "value": 1.0},))
+    at_times = dataclasses.replace(always, intervals=((1.0, 2.0),))
+    lasting, passing = sure([always, at_times])
+    assert 1 - passing > 1.5 * (1 - lasting)
+
+
 def test_torque_that_is_small_beside_what_stays_wrong_elsewhere_is_doubted():
     clear, small = (sure([found([1.0, 0.0])], held_out=np.array([x, 0.2]))[0] for x in (0.1, 1.0))
     assert small < clear - 0.3

@@ -27,6 +27,7 @@ from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.drive import JointSpring
 from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
+from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueDrift, TorqueOffset
 
 
@@ -425,6 +426,19 @@ def test_a_law_that_predicts_no_better_where_it_was_not_fitted_is_hardly_believe
     assert (sure.effect, lost.effect) == ("coulomb_friction", "coulomb_friction")
     assert sure.confidence > 0.9
     assert lost.confidence <= 0.1
+
+
+@pytest.mark.slow
+def test_a_law_that_goes_by_another_name_once_its_shape_is_polished_is_as_likely():
+    problem = posed(record(7, lambda t, q, qd, qdd: 0.5 * np.tanh(qd / 0.01) * (np.arange(7) == 1)))
+    sticks, slips = (
+        with_terms(problem, [problem.term(PreslidingHysteresis(1, x, "dahl only"), np.array([0.5]))])
+        for x in (1.4e-3, 1.6e-3)
+    )
+    (as_searched,) = findings(problem, sticks, sticks, sticks, [False])
+    (polished,) = findings(problem, sticks, slips, slips, [False])
+    assert (as_searched.effect, polished.effect) == ("coulomb_friction", "presliding_hysteresis")
+    assert polished.confidence == pytest.approx(as_searched.confidence, abs=0.01)
 
 
 @pytest.mark.slow

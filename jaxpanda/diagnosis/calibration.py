@@ -1,18 +1,19 @@
 r"""From the weights of the models that were compared to a probability of being right.
 
 The models compared are those of the catalogue, each with one other term in a place. What the catalogue lacks is
-not among them, so that their weights are too sure: most where something stays unexplained, and where a law is
-small beside others at its joint, or beside what the model gets wrong of torque that it was not fitted to: it may
-be what those are off by. How often findings like this one are right was counted in trials, simulated ones and on
-recordings of real arms, and a logistic regression on the count (Platt, Advances in Large Margin Classifiers 1999)
-says
+not among them, so that their weights are too sure: most where something stays unexplained; where a law is small
+beside others at its joint, or beside what the model gets wrong of torque that it was not fitted to, and may be
+what those are off by; and where it acts for a while only, when nothing else in the recordings tests it. How often
+findings like this one are right was counted in trials, simulated ones and on recordings of real arms, and a
+logistic regression on the count (Platt, Advances in Large Margin Classifiers 1999) says
 
-$$\operatorname{logit} P = w_0 + w_1 \operatorname{logit} p + w_2 \log_{10} s + w_3 \log_{10} a + w_4 f + w_5 u$$
+$$\operatorname{logit} P
+  = w_0 + w_1 \operatorname{logit} p + w_2 \log_{10} s + w_3 \log_{10} a + w_4 f + w_5 u + w_6 e$$
 
 with p the weight; s the finding's share of the squared torque of all findings at the joint where it stands out
 most; a its torque there over the held-out error; $f = \operatorname{sgn}(F) \log_{10}(1 + |F|)$ of the nats F by
-which it makes torque likelier that nothing was fitted to (`Finding.foretold`); and u whether something is left
-unexplained. `experiments/calibrate.py` fits w.
+which it makes torque likelier that nothing was fitted to (`Finding.foretold`); u whether something is left
+unexplained; and e whether it is a law that acts in an interval only. `experiments/calibrate.py` fits w.
 """
 
 import dataclasses
@@ -20,12 +21,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.special
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .finding import Finding, Fit
 
-WEIGHTS = (-0.92, 0.13, 0.09, 2.38, 0.72, -0.82)
-"""$w_0 \\ldots w_5$."""
+WEIGHTS = (-0.91, 0.07, 0.0, 2.12, 0.85, -0.68, -1.33)
+"""$w_0 \\ldots w_6$."""
 SUREST = 0.995
 """No finding is surer."""
 TOLD, SMALL = 0.25, 2.0
@@ -47,7 +48,8 @@ def calibrated(findings: Sequence[Finding], verdict: str, fit: Fit) -> list[Find
         return []
     sizes = np.stack([f.rms_torque for f in findings]) / _error(fit)
     foretold = [f.evidence if f.foretold is None else f.foretold for f in findings]
-    x = features(sizes, np.array(foretold), verdict == "explained")
+    at_times = np.array([bool(f.parameters) and f.intervals is not None for f in findings])
+    x = features(sizes, np.array(foretold), verdict == "explained", at_times)
     return [_calibrated(f, of_one) for f, of_one in zip(findings, x, strict=True)]
 
 
@@ -69,14 +71,18 @@ def _error(fit: Fit) -> Float[np.ndarray, " dof"]:
 
 
 def features(
-    sizes: Float[np.ndarray, "findings dof"], foretold: Float[np.ndarray, " findings"], explained: bool
-) -> Float[np.ndarray, "findings 5"]:
-    r"""What tells how often a weight is right, but for the weight itself: 1, $\log_{10} s$, $\log_{10} a$, f, u.
+    sizes: Float[np.ndarray, "findings dof"],
+    foretold: Float[np.ndarray, " findings"],
+    explained: bool,
+    at_times: Bool[np.ndarray, " findings"],
+) -> Float[np.ndarray, "findings 6"]:
+    r"""What tells how often a weight is right, beside the weight: 1, $\log_{10} s$, $\log_{10} a$, f, u and e.
 
     Args:
         sizes: torque of each finding at each joint over the held-out error.
         foretold: nats by which each makes torque likelier that nothing was fitted to.
         explained: whether nothing is left unexplained.
+        at_times: which are laws that act in an interval only.
     """
     squares = np.square(sizes)
     at = squares.argmax(1)
@@ -89,6 +95,7 @@ def features(
             np.log10(np.maximum(sizes[each, at], _LEAST_SIZE)),
             np.sign(foretold) * np.log10(1 + np.abs(foretold)),
             np.full(len(sizes), 0.0 if explained else 1.0),
+            at_times.astype(float),
         ],
         1,
     )
@@ -99,7 +106,7 @@ def weight_of(posterior: float) -> float:
     return float(scipy.special.logit(np.clip(posterior, 1 - SUREST, SUREST)))
 
 
-def _calibrated(finding: Finding, x: Float[np.ndarray, " 5"]) -> Finding:
+def _calibrated(finding: Finding, x: Float[np.ndarray, " 6"]) -> Finding:
     first, own, *others = WEIGHTS
     sure = float(scipy.special.expit(own * weight_of(finding.confidence) + x @ [first, *others]))
     # what is taken from the finding goes to what nobody thought of; what it gains, the others lose

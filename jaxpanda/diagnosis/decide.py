@@ -184,10 +184,13 @@ def _same(problem: Problem, a: Term, b: Term) -> bool:
 
 
 def _rivals(problem: Problem, searched: State, state: State, i: int) -> tuple[float, dict[str, float], float]:
-    """Evidence of a term, probability of each effect in its place, its own included."""
+    """Evidence of a term, probability of each effect in its place, and of its own."""
     evidence = state.design.log_evidence - without(state, i).log_evidence
     probability = posterior(problem, searched, i)
-    return evidence, probability, probability.get(state.terms[i].effect.title, 0.0)
+    was, title = searched.terms[i].effect.title, state.terms[i].effect.title
+    if was != title:  # polished, the same law may go by another name
+        probability[title] = probability.get(title, 0.0) + probability.pop(was, 0.0)
+    return evidence, probability, probability.get(title, 0.0)
 
 
 def _finding(
