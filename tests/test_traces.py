@@ -12,7 +12,9 @@ from mjcf_cases import chain_of
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis.traces import WORK_RATE, held_sign, prepare, trajectory, work_rate
+from jaxpanda.effects import Turn, joint_columns
 from jaxpanda.effects.friction import FrictionDrift, LoadDependentFriction
+from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.motion import Channels
 from jaxpanda.effects.sensing import TorqueDrift
 from jaxpanda.errors import InputError
@@ -41,6 +43,20 @@ def test_samples_weigh_less_where_known_friction_has_no_known_sign():
     assert np.all(trace.trust[(t > 2.4) & (t < 3.6), 0] == 1)  # it moves
     assert np.all(trace.trust[(t < 1.8) | (t > 4.2), 0] < 0.4)  # it rests
     assert np.all(trace.trust[(t < 1.8) | (t > 4.2), 1:] == 1)  # no friction is known there
+
+
+def test_noise_of_a_joint_at_rest_does_not_wear_away_what_its_bristles_hold():
+    q = np.concatenate([steps(), np.full(int(10 * RATE), 0.6)])
+    recording = moved(q)
+    noise = 2e-5 * np.random.default_rng(3).normal(size=recording.q.shape)
+    recording = dataclasses.replace(recording, q=1e-4 * np.round((recording.q + noise) / 1e-4))
+    bristles = PreslidingHysteresis(0, 7e-4, "dahl only")
+    predicted = trajectory(recording).trace(Arm.panda(), (Turn("distance", 7e-4),) * 7)
+    assert np.all(predicted.sign[predicted.channels.t > 5.0, 0] > 0.98)
+    for trace in (predicted, prepare(recording, Arm.panda())):
+        held = joint_columns([bristles], trace.stretches, trace.dt)[:, 0, 0]
+        assert np.all(held[trace.channels.t > 5.0] > 0.98)
+        assert np.all(np.abs(held[trace.channels.t < 1.5]) < 0.2)  # nor does it bend any
 
 
 def test_samples_weigh_less_where_motion_is_sharper_than_its_filter():

@@ -10,10 +10,12 @@ import functools
 import itertools
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.interpolate
 import scipy.ndimage
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from .. import signals as signals_
 from ..arms.arm import Arm
@@ -180,6 +182,8 @@ class Trajectory:
     smoothed: Smoothed
     slowest: Float[np.ndarray, "time dof"]
     """Speeds that noise of q may pretend [rad/s]."""
+    jitter: Float[np.ndarray, "time dof"]
+    """Travel that it may pretend [rad]."""
 
     def trace(self, arm: Arm, turns: Sequence[Turn | None] = (), below: float = np.inf) -> Trace:
         """On the grids of a prediction.
@@ -194,7 +198,8 @@ class Trajectory:
         if below < _most(rate):
             motion = tuple(signals_.zero_phase(x, below, rate) for x in motion)
         keep = np.arange(0, len(self.signals.time), _thinnest(rate, WORK_RATE))
-        return _on_grids(self.recording, self.signals, keep, motion, self.slowest, arm, turns, WORK_RATE)
+        pretended = self.slowest, self.jitter
+        return _on_grids(self.recording, self.signals, keep, motion, pretended, arm, turns, WORK_RATE)
 
 
 def trajectory(recording: Recording) -> Trajectory:
@@ -202,10 +207,9 @@ def trajectory(recording: Recording) -> Trajectory:
     signals = signals_.prepare(recording, cutoff=3.0, rate=WORK_RATE, trim=0.0)
     rate, time, rows = signals.rate, signals.time, recording.time
     position = _across_gaps(_splined(recording, time), rows, recording.q, time, rate)
-    step = _least_step(recording.q)
-    moved = smooth(position, np.where(np.isfinite(step), step, 0.0), rate, _most(rate))
-    slowest = _REST * _velocity_noise(_position_noise(position), moved.cutoff, rate)
-    return Trajectory(recording, signals, moved, slowest)
+    step = _written_in(recording)
+    moved = smooth(position, step, rate, _most(rate))
+    return Trajectory(recording, signals, moved, *_pretended(position, step, moved.cutoff, rate))
 
 
 def _most(rate: float) -> float:
@@ -227,9 +231,9 @@ def prepare(recording: Recording, arm: Arm, *, coarse: float = WORK_RATE) -> Tra
     noise = None if rough.tau is None else signals_.white_noise(rough.tau)
     cutoff_q = min(position_cutoff(position, noise, arm, rate), _FELT * coarse)
     q, qd, qdd = continued_derivatives(position, cutoff_q, rate)
-    width = _REST * _velocity_noise(_position_noise(position), cutoff_q, rate)
-    trace = _on_grids(recording, rough, keep, (q, qd, qdd), width, arm, (), coarse)
-    doubtful = _unsure_sign(position, qd, width + _TURN * np.abs(qdd), cutoff_q, rate)[keep]
+    pretended = _pretended(position, _written_in(recording), cutoff_q, rate)
+    trace = _on_grids(recording, rough, keep, (q, qd, qdd), pretended, arm, (), coarse)
+    doubtful = _unsure_sign(position, qd, pretended[0] + _TURN * np.abs(qdd), cutoff_q, rate)[keep]
     trace = dataclasses.replace(trace, unsure=doubtful)
     if noise is None:
         return trace
@@ -250,12 +254,15 @@ def _on_grids(
     signals: signals_.Signals,
     keep: np.ndarray,
     moved: Sequence[Float[np.ndarray, "time dof"]],
-    least: Float[np.ndarray, "*time dof"],
+    pretended: Sequence[Float[np.ndarray, "*time dof"]],
     arm: Arm,
     turns: Sequence[Turn | None],
     coarse: float,
 ) -> Trace:
-    """A motion, its derivatives and its torque on a fine grid and on the coarse one of the samples `keep`."""
+    """A motion, its derivatives and its torque on a fine grid and on the coarse one of the samples `keep`.
+
+    `pretended`: the speed and the travel of a joint at rest that noise may pretend [rad/s, rad].
+    """
     rate, time = signals.rate, signals.time
     stride = int(np.min(np.diff(keep)))
     thin = next(k for k in range(min(stride, _thinnest(rate, coarse)), 0, -1) if stride % k == 0)
@@ -263,11 +270,14 @@ def _on_grids(
     kept, dt = (keep - fine[0]) // thin, thin / rate
     cutoff = min(_FELT * rate / stride, 0.45 * rate)
     q, qd, qdd = moved
+    slowest, jitter = (np.broadcast_to(x, q.shape)[fine] for x in pretended)
+    settled = _settled(q[fine], qd[fine], slowest, jitter)
+    travels = np.diff(settled, axis=0, append=settled[-1:]) != 0
 
-    sign = held_sign(arm, qd[fine], qdd[fine], np.broadcast_to(least, q.shape)[fine])
+    sign = held_sign(arm, qd[fine], qdd[fine], slowest)
     for joint, turn in enumerate(turns):
         if turn is not None:
-            sign[:, joint] = turn.share(q[fine, joint], qd[fine, joint])
+            sign[:, joint] = turn.share(settled[:, joint], qd[fine, joint])
     held_fine = np.asarray(arm.damping) * qd[fine] + np.asarray(arm.frictionloss) * sign
     held = held_fine[kept]
     if stride > thin:
@@ -285,10 +295,57 @@ def _on_grids(
         return scipy.interpolate.CubicSpline(motion.time, x)(np.clip(time[fine], *motion.time[[0, -1]]))
 
     load, shown = finely(motion.load), None if tau is None else finely(tau)
-    channels = Channels(time[fine], q[fine], qd[fine], qdd[fine], load, load + held_fine, shown)
+    channels = Channels(time[fine], q[fine], qd[fine] * travels, qdd[fine], load, load + held_fine, shown)
     weight = _weight(recording.time, time[keep], rate)
     trust = np.ones(motion.q.shape)
     return Trace(recording.name, signals, channels, dt, motion, tau, weight, kept, cutoff, sign, trust)
+
+
+def _settled(
+    q: Float[np.ndarray, "time dof"],
+    qd: Float[np.ndarray, "time dof"],
+    slowest: Float[np.ndarray, "time dof"],
+    jitter: Float[np.ndarray, "time dof"],
+) -> Float[np.ndarray, "time dof"]:
+    """Positions that stay where they are as long as q is within `jitter` of them (the play operator).
+
+    Noise of a joint at rest is no motion: as one it would wear away what bent bristles hold.
+    """
+    begins = q[0] - np.where(np.abs(qd[0]) > slowest[0], np.sign(qd[0]) * jitter[0], 0.0)
+    more = (1 << (len(q) - 1).bit_length()) - len(q)  # few lengths, few compilations
+    low, high = (np.pad(limit, ((0, more), (0, 0)), "edge") for limit in (q - jitter, q + jitter))
+    return np.asarray(_between(begins, low, high))[: len(q)]
+
+
+@jax.jit
+def _between(
+    at: Float[Array, " dof"], low: Float[Array, "time dof"], high: Float[Array, "time dof"]
+) -> Array:
+    """What goes only where limits push it."""
+
+    def step(at, limits):
+        at = jnp.clip(at, *limits)
+        return at, at
+
+    return jax.lax.scan(step, at, (low, high))[1]
+
+
+def _pretended(
+    position: Float[np.ndarray, "time dof"],
+    step: Float[np.ndarray, " dof"],
+    cutoff: float | Float[np.ndarray, "time dof"],
+    rate: float,
+) -> tuple[Float[np.ndarray, "*time dof"], Float[np.ndarray, "*time dof"]]:
+    """Speed and travel that noise of q, behind its low-pass, may pretend of a joint at rest [rad/s, rad]."""
+    noise = _position_noise(position)
+    travel = _REST * noise * np.sqrt(2 * cutoff / rate) + 0.5 * step
+    return _REST * _velocity_noise(noise, cutoff, rate), travel
+
+
+def _written_in(recording: Recording) -> Float[np.ndarray, " dof"]:
+    """The steps of each joint's encoder [rad]; 0 where it never moves."""
+    step = _least_step(recording.q)
+    return np.where(np.isfinite(step), step, 0.0)
 
 
 def _thinnest(rate: float, coarse: float) -> int:
