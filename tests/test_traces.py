@@ -59,6 +59,18 @@ def test_noise_of_a_joint_at_rest_does_not_wear_away_what_its_bristles_hold():
         assert np.all(np.abs(held[trace.channels.t < 1.5]) < 0.2)  # nor does it bend any
 
 
+def test_bristles_turn_where_the_joint_does_however_noisy_its_encoder():
+    t = np.arange(int(6 * RATE)) / RATE
+    sweeps = 0.3 * np.sin(np.pi * t)
+    true = Turn("distance", 1e-3).share(sweeps, np.gradient(sweeps, t))
+    recording = moved(sweeps)
+    noise = 2e-4 * np.random.default_rng(4).normal(size=recording.q.shape)
+    recording = dataclasses.replace(recording, q=recording.q + noise)
+    trace = trajectory(recording).trace(Arm.panda(), (Turn("distance", 1e-3),) * 7)
+    off = trace.sign[:, 0] - np.interp(trace.channels.t, t, true)
+    assert np.sqrt(np.mean(off[trace.channels.t > 0.3] ** 2)) < 0.01
+
+
 def test_samples_weigh_less_where_motion_is_sharper_than_its_filter():
     t = np.arange(int(6 * RATE)) / RATE
     trace = prepare(moved(0.5 * np.abs(np.sin(0.5 * np.pi * t))), Arm.panda())  # speed jumps at 2 s and 4 s

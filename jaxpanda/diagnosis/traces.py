@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.interpolate
 import scipy.ndimage
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .. import signals as signals_
 from ..arms.arm import Arm
@@ -271,7 +271,7 @@ def _on_grids(
     cutoff = min(_FELT * rate / stride, 0.45 * rate)
     q, qd, qdd = moved
     slowest, jitter = (np.broadcast_to(x, q.shape)[fine] for x in pretended)
-    settled = _settled(q[fine], qd[fine], slowest, jitter)
+    settled = _settled(q[fine], jitter)
     travels = np.diff(settled, axis=0, append=settled[-1:]) != 0
 
     sign = held_sign(arm, qd[fine], qdd[fine], slowest)
@@ -302,32 +302,45 @@ def _on_grids(
 
 
 def _settled(
-    q: Float[np.ndarray, "time dof"],
-    qd: Float[np.ndarray, "time dof"],
-    slowest: Float[np.ndarray, "time dof"],
-    jitter: Float[np.ndarray, "time dof"],
+    q: Float[np.ndarray, "time dof"], jitter: Float[np.ndarray, "time dof"]
 ) -> Float[np.ndarray, "time dof"]:
-    """Positions that stay where they are as long as q is within `jitter` of them (the play operator).
+    """Positions that go one way from one reversal to the next, and no sooner than they must; of reversals those
+    count that lead back by more than twice `jitter`.
 
     Noise of a joint at rest is no motion: as one it would wear away what bent bristles hold.
     """
-    begins = q[0] - np.where(np.abs(qd[0]) > slowest[0], np.sign(qd[0]) * jitter[0], 0.0)
     more = (1 << (len(q) - 1).bit_length()) - len(q)  # few lengths, few compilations
-    low, high = (np.pad(limit, ((0, more), (0, 0)), "edge") for limit in (q - jitter, q + jitter))
-    return np.asarray(_between(begins, low, high))[: len(q)]
+    given = (np.pad(x, ((0, more), (0, 0)), "edge") for x in (q, 2 * jitter))
+    turned, since = (np.asarray(x)[: len(q)] for x in _reversals(*given))
+    out = np.empty(q.shape)
+    for joint, column in enumerate(q.T):
+        ways = np.split(column, since[turned[:, joint], joint])
+        limits = (np.maximum if k % 2 else np.minimum for k in range(len(ways)))
+        out[:, joint] = np.concatenate(
+            [limit.accumulate(way[::-1])[::-1] for limit, way in zip(limits, ways, strict=True)]
+        )
+    return out
 
 
 @jax.jit
-def _between(
-    at: Float[Array, " dof"], low: Float[Array, "time dof"], high: Float[Array, "time dof"]
-) -> Array:
-    """What goes only where limits push it."""
+def _reversals(
+    q: Float[Array, "time dof"], least: Float[Array, "time dof"]
+) -> tuple[Bool[Array, "time dof"], Int[Array, "time dof"]]:
+    """Where a joint has come back by so much from the farthest that it went, upwards first, and since when."""
 
-    def step(at, limits):
-        at = jnp.clip(at, *limits)
-        return at, at
+    def step(state, now):
+        way, farthest, since = state
+        k, here, back = now
+        on, turns = way * (here - farthest) >= 0, way * (farthest - here) > back
+        kept = (
+            jnp.where(turns, -way, way),
+            jnp.where(on | turns, here, farthest),
+            jnp.where(on | turns, k, since),
+        )
+        return kept, (turns, since)
 
-    return jax.lax.scan(step, at, (low, high))[1]
+    begins = jnp.ones_like(q[0]), q[0], jnp.zeros(q.shape[1], int)
+    return jax.lax.scan(step, begins, (jnp.arange(len(q)), q, least))[1]
 
 
 def _pretended(
