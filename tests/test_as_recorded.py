@@ -106,6 +106,22 @@ def test_prediction_takes_no_more_of_fast_motion_than_the_torque_showed():
     np.testing.assert_array_equal(np.delete(error(found), [1, 3]), np.delete(error(plain), [1, 3]))
 
 
+@pytest.mark.parametrize(
+    ("judged", "others_are"), [((1,), True), ((0, 1, 3), True), ((0, 1, 2), False), ((), False)]
+)
+def test_torque_of_a_joint_that_tells_nothing_is_filtered_as_that_of_most_others(judged, others_are):
+    arm, zeros = Arm.panda(), jnp.zeros(7)
+    plain = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
+    swings = trajectory(reversing(arm, (1, 3), 6.0))
+    found = as_recorded([swings], plain, [j in judged for j in range(7)])
+    below = found.cutoffs or (None,) * 7
+    assert [cutoff is not None for cutoff in below] == [
+        j in (1, 3) if j in judged else others_are for j in range(7)
+    ]
+    if others_are:
+        assert below[6] in (below[1], below[3])
+
+
 def test_of_a_long_recording_the_beginning_is_compared(monkeypatch):
     """Friction that turns otherwise in what follows, and is stronger there, decides nothing if left out."""
     arm, zeros = dataclasses.replace(Arm.panda(), frictionloss=jnp.full(7, 0.5)), jnp.zeros(7)

@@ -31,16 +31,20 @@ def as_recorded(whole: Sequence[Trajectory], corrected: Corrected, judged: Seque
     """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings.
 
     Of joints that were not `judged` their own torque tells nothing: friction at rest may have carried any load.
+    They are as most others are, as the torque of all goes through filters of one make.
     """
     moved = [_beginning(one) for one in whole]
     best = dataclasses.replace(corrected, turns=_turns(moved, corrected, judged))
     each = [dataclasses.replace(best, cutoffs=(cutoff,) * corrected.arm.dof) for cutoff in CUTOFFS]
     slower = [_squares(moved, one) for one in each]
     # a smaller share may be noise of q, and another motion faster
-    filtered = (np.min(slower, 0) < MOST * _squares(moved, best)) & np.asarray(judged)
-    cutoffs = [CUTOFFS[k] if low else None for k, low in zip(np.argmin(slower, 0), filtered, strict=True)]
+    filtered = np.min(slower, 0) < MOST * _squares(moved, best)
+    cutoffs = np.where(filtered, np.array(CUTOFFS)[np.argmin(slower, 0)], np.inf)
+    known = np.sort(cutoffs[np.asarray(judged)])
+    cutoffs[~np.asarray(judged)] = known[len(known) // 2] if len(known) else np.inf
     recorded = Recorded.of([one.recording for one in whole])
-    return dataclasses.replace(best, cutoffs=tuple(cutoffs) if any(filtered) else (), recorded=recorded)
+    below = tuple(float(cutoff) if np.isfinite(cutoff) else None for cutoff in cutoffs)
+    return dataclasses.replace(best, cutoffs=below if any(below) else (), recorded=recorded)
 
 
 def _turns(
