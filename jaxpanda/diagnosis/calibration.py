@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 
 from .finding import Finding, Fit
 
-WEIGHTS = (-0.91, 0.07, 0.0, 2.12, 0.85, -0.68, -1.33)
+WEIGHTS = (-1.05, 0.09, 0.0, 2.19, 0.93, -0.91, -1.4)
 """$w_0 \\ldots w_6$."""
 SUREST = 0.995
 """No finding is surer."""
