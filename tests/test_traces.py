@@ -67,6 +67,7 @@ def test_bristles_turn_where_the_joint_does_however_noisy_its_encoder():
     noise = 2e-4 * np.random.default_rng(4).normal(size=recording.q.shape)
     recording = dataclasses.replace(recording, q=recording.q + noise)
     trace = trajectory(recording).trace(Arm.panda(), (Turn("distance", 1e-3),) * 7)
+    assert np.all(trace.channels.qd[[0, -1]] != 0)  # at the ends too
     off = trace.sign[:, 0] - np.interp(trace.channels.t, t, true)
     assert np.sqrt(np.mean(off[trace.channels.t > 0.3] ** 2)) < 0.01
 

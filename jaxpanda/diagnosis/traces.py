@@ -272,7 +272,8 @@ def _on_grids(
     q, qd, qdd = moved
     slowest, jitter = (np.broadcast_to(x, q.shape)[fine] for x in pretended)
     settled = _settled(q[fine], jitter)
-    travels = np.diff(settled, axis=0, append=settled[-1:]) != 0
+    moves = np.diff(settled, axis=0) != 0
+    travels = np.pad(moves, ((1, 0), (0, 0))) | np.pad(moves, ((0, 1), (0, 0)))
 
     sign = held_sign(arm, qd[fine], qdd[fine], slowest)
     for joint, turn in enumerate(turns):
