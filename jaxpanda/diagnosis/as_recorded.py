@@ -31,7 +31,7 @@ def as_recorded(whole: Sequence[Trajectory], corrected: Corrected, judged: Seque
     """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings.
 
     Of joints that were not `judged` their own torque tells nothing: friction at rest may have carried any load.
-    They are as most others are, as the torque of all goes through filters of one make.
+    They are taken to be as most others are.
     """
     moved = [_beginning(one) for one in whole]
     best = dataclasses.replace(corrected, turns=_turns(moved, corrected, judged))
