@@ -229,6 +229,18 @@ def test_compiler_settings_that_overrule_an_inertial_are_refused(setting, reason
         write_parameters(source, arm, source.standard * np.array([[1.1], [0.9]]))
 
 
+def test_a_file_that_takes_every_inertia_from_geoms_gets_those_of_the_arm(tmp_path):
+    file = tmp_path / "arm.xml"
+    text = chain_of('<joint name="second"/><geom size="0.1"/>', before='<compiler inertiafromgeom="true"/>')
+    file.write_text(re.sub("<inertial[^>]*/>", '<geom size="0.2"/>', text))
+    arm, source = from_mjcf(file)
+    assert write_parameters(source, arm, source.standard).text == file.read_text()
+    wanted = source.standard * np.array([[1.1], [1.0]])
+    result = write_parameters(source, arm, wanted)
+    assert [c.attribute for c in result.changes] == ["inertial", "inertiafromgeom"]
+    np.testing.assert_allclose(from_document(result.document)[1].standard, wanted, rtol=1e-12, atol=1e-15)
+
+
 @pytest.mark.parametrize("before", ['<option><flag damper="disable"/></option>', ""])
 def test_damping_that_something_else_decides_is_refused(before, tmp_path):
     file = tmp_path / "arm.xml"

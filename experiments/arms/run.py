@@ -68,9 +68,11 @@ def arms(models: Path, only: list[str]) -> list[tuple[str, Path, Part]]:
 def beside(file: Path, folder: Path) -> Path:
     """Where to export to: a folder in which meshes are found as beside the model, by links."""
     folder.mkdir()
-    for other in file.parent.iterdir():
-        if other.is_dir():
-            (folder / other.name).symlink_to(other.resolve())
+    for other in file.parent.glob("*/**/*"):
+        if other.is_file() and other.suffix != ".xml":
+            link = folder / other.relative_to(file.parent)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(other.resolve())
     return folder / "exported.xml"
 
 

@@ -173,7 +173,7 @@ def write_parameters(
     edits: list[markup.Edit] = []
     meant = source.standard.copy()
     if standard is not None:
-        _check_inertials_count(source)
+        counting = _inertials_that_count(source)
         for i, link in enumerate(source.links):
             target = np.asarray(standard[i], float)
             if not _agree(target, meant[i], np.asarray(standard)):
@@ -184,6 +184,7 @@ def write_parameters(
                     )
                 meant[i], edit = _inertial_edit(source, link, bodies[i], target, warnings)
                 edits.append(edit)
+        edits += counting if edits else []
     joints = _joint_values(arm, friction)
     edits += _joint_edits(source, bodies, before, joints)
     edited = markup.edit(source.document, edits)
@@ -211,16 +212,23 @@ def _check_geometry(source: MjcfSource, before: Arm, arm: Arm) -> None:
         )
 
 
-def _check_inertials_count(source: MjcfSource) -> None:
-    """Refuse compiler settings under which MuJoCo does not take an `inertial` as written."""
-    for element in source.document.root.walk():
+def _inertials_that_count(source: MjcfSource) -> list[markup.Edit]:
+    """Refuse compiler settings under which MuJoCo does not take an `inertial` as written. A file without any
+    needs no `inertiafromgeom`, as bodies without one have the inertia of their geoms anyway: the edits say so."""
+    elements = list(source.document.root.walk())
+    edits = []
+    for element in (e for e in elements if e.tag == "compiler"):
         for name, harmless in (("inertiafromgeom", ("auto", "false")), ("settotalmass", ("-1",))):
-            value = element.attributes.get(name) if element.tag == "compiler" else None
-            if value is not None and value not in harmless:
+            value = element.attributes.get(name)
+            if value is None or value in harmless:
+                continue
+            if name == "settotalmass" or any(e.tag == "inertial" for e in elements):
                 raise InputError(
                     f"{element.file}: line {element.line}: compiler {name}={value!r} overrides"
                     " every <inertial>; take it out first"
                 )
+            edits.append(markup.Edit(element, {name: "auto"}))
+    return edits
 
 
 def _body_elements(source: MjcfSource) -> list[markup.Element]:

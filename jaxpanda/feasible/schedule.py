@@ -21,6 +21,7 @@ from jax.sharding import SingleDeviceSharding
 from jaxtyping import Array, Int, PyTree
 
 from ..ranks import ALONE, Ranks
+from ..xla import ON_CPU
 from .checkpoint import Checkpoint
 
 Chunk = Callable[..., PyTree[Array]]
@@ -32,8 +33,6 @@ A negative number fills a place that no start is left for; its row is not looked
 Device = Any
 """A `jax.Device`, which type checkers do not know."""
 
-_QUICKLY = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-"""Compiles the solver in a third of the time on a CPU, and it runs as fast."""
 _PIECE = 16384
 """Starts fetched at once: memory for a large chunk would be new to the process every time, page after page."""
 _WORTH = 4  # chunks a further CPU device must get: it shares the cores, and compiling for it costs as much
@@ -175,7 +174,7 @@ def _program(
     lowered = jitted.lower(leaves, shaped((chunk,), jnp.asarray(0).dtype))
     if device.platform == "cpu":
         with contextlib.suppress(jax.errors.JaxRuntimeError):  # another version may not know these options
-            return lowered.compile(compiler_options=_QUICKLY), lowered.out_info[0]
+            return lowered.compile(compiler_options=ON_CPU), lowered.out_info[0]
     return lowered.compile(), lowered.out_info[0]
 
 

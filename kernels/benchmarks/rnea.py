@@ -237,7 +237,10 @@ def mjx(folder: Path, batch: int, note: Callable[[str, float], None]) -> dict[st
     device = mujoco_x.put_model(model)
     blank = mujoco_x.make_data(device)
 
-    @jax.jit
+    # as XLA compiles it for a CPU by default, MJX computes the pose of a link anew for each one behind it
+    options = {"xla_cpu_use_fusion_emitters": False} if jax.default_backend() == "cpu" else None
+
+    @functools.partial(jax.jit, compiler_options=options)
     @jax.vmap
     def torque(q, qd, qdd):
         return mujoco_x.inverse(device, blank.replace(qpos=q, qvel=qd, qacc=qdd)).qfrc_inverse
