@@ -25,6 +25,9 @@ from jaxtyping import Float
 from .errors import InputError
 from .recordings.recording import Recording
 
+_MOST_STEPS = 5e6
+"""Integration steps of a recording, at most: some ten minutes."""
+
 
 @dataclasses.dataclass(frozen=True)
 class FourierTrajectory:
@@ -250,7 +253,7 @@ def simulate(
         name: of the recording.
 
     Raises:
-        InputError: no such arm, or a trajectory for another one.
+        InputError: no such arm, a trajectory for another one, or friction that brakes too little inertia too hard.
     """
     compiled = _prepared(model)
     if compiled.nv != trajectory.dof:
@@ -260,8 +263,13 @@ def simulate(
         raise InputError(f"a recording of {duration} s at {rate} Hz has fewer than two samples")
     friction = _with_frictionloss(friction or JointFriction(), compiled)
     arm = _Tracking(compiled, trajectory, friction, bandwidth)
-    time = np.arange(samples) / rate
-    q, qd, u = arm.run(time, arm.substeps(1 / rate))
+    time, substeps = np.arange(samples) / rate, arm.substeps(1 / rate)
+    if samples * substeps > _MOST_STEPS:
+        raise InputError(
+            f"{arm.stiffest()}: {samples} samples would take {samples * substeps:.1e} integration steps; give the"
+            " joint the armature of its drive, or less friction or damping"
+        )
+    q, qd, u = arm.run(time, substeps)
     return _logged(name, time, q, qd, u, sensors or Sensors(), np.random.default_rng(seed))
 
 
@@ -378,13 +386,26 @@ class _Tracking:
 
         D is the damping of the feedback and the steepest slope of friction, met at rest.
         """
-        steepest = self.friction.viscous + np.abs(self.friction.coulomb) / self.friction.width
-        slope = self.damping + np.diag(np.broadcast_to(steepest, self.model.nv))
+        slope = self.damping + np.diag(self._steepest())
         poses = self.trajectory(np.linspace(0, 2 * np.pi / self.trajectory.w, 500))[
             0
         ]  # some are passed quickly
         rates = [np.linalg.eigvals(np.linalg.solve(self._mass_matrix(q), slope)) for q in poses]
         return int(np.ceil(interval * np.abs(rates).max() / 2))
+
+    def _steepest(self) -> Float[np.ndarray, " dof"]:
+        """Slope of friction over velocity at rest [N m s/rad]."""
+        slope = self.friction.viscous + np.abs(self.friction.coulomb) / self.friction.width
+        return np.broadcast_to(slope, self.model.nv)
+
+    def stiffest(self) -> str:
+        """Which joint's friction brakes it most abruptly."""
+        moved = np.diag(np.linalg.inv(self._mass_matrix(self.trajectory.q0)))
+        joint = int(np.argmax(moved * self._steepest()))
+        return (
+            f"joint {self.model.joint(joint).name!r}, of {1 / moved[joint]:.2g} kg·m² about its axis, rubs by"
+            f" {self._steepest()[joint]:.3g} N·m·s/rad at rest"
+        )
 
     def _feed_forward(self, q, qd, qdd) -> Float[np.ndarray, "time dof"]:
         """Torque of the reference under the model, friction unknown to it."""

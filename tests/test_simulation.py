@@ -135,6 +135,14 @@ def test_friction_that_the_file_holds_is_felt_too():
     assert np.abs(simulate(PENDULUM.format(joint=""), swing, **kwargs).tau - given.tau).max() > 0.3
 
 
+def test_a_joint_too_light_for_its_friction_is_named():
+    light = PENDULUM.replace('-0.5" diaginertia="0.1 0.1 0.1"', '0" diaginertia="1e-6 1e-6 1e-6"')
+    with pytest.raises(InputError, match=r"'hinge', of 1e-06 kg·m² about its axis, rubs by 100 .* armature"):
+        simulate(
+            light.format(joint='frictionloss="2"'), fourier_trajectory([[1.0]], [[0.0]], [0.0]), duration=1.0
+        )
+
+
 def test_random_trajectories_stay_within_limits_of_any_arm():
     xml = to_mjcf(random_chain(1, 5), random_bodies(1, 5), joint='limited="true" range="-0.4 1.2"')
     one, other = (random_trajectory(xml, seed, speed=1.0, acceleration=3.0) for seed in (0, 1))
