@@ -253,7 +253,7 @@ def simulate(
         name: of the recording.
 
     Raises:
-        InputError: no such arm, a trajectory for another one, or friction that brakes too little inertia too hard.
+        InputError: no such arm, a trajectory for another one, or friction too steep for a light joint.
     """
     compiled = _prepared(model)
     if compiled.nv != trajectory.dof:
