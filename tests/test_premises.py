@@ -5,10 +5,10 @@ import pytest
 
 from jaxpanda import Arm
 from jaxpanda.arms.export import panda_mjcf
-from jaxpanda.diagnosis import premises
+from jaxpanda.diagnosis import diagnosis, premises
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
-from jaxpanda.diagnosis.state import start
+from jaxpanda.diagnosis.state import start, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.simulation import JointFriction, Sensors, random_trajectory, simulate
@@ -31,6 +31,29 @@ def test_what_healthy_recordings_show_may_be_refitted_in_all_recordings():
     news = problem.full_columns(TorqueOffset(3))
     assert np.any(news[0])
     assert not np.any(news[1])  # an effect that is searched for acts in the suspect recording alone
+
+
+@pytest.mark.parametrize("comes_again", [True, False])
+def test_what_healthy_recordings_show_is_predicted_where_it_comes_again(monkeypatch, comes_again):
+    """Two seconds of an arm had a crosstalk of 1.05, with which another motion was predicted 20 N·m off."""
+    motion, made = random_trajectory(panda_mjcf(), 1, period=3.0), []
+    for k in range(2):
+        one = simulate(panda_mjcf(), motion, duration=6.0, rate=200.0, friction=JointFriction(),
+                       sensors=Sensors(torque_noise=0.05), seed=k, name=f"{k}.csv")  # fmt: skip
+        one.tau[:, 3] += 0.5 if comes_again else 0.5 * np.repeat([1, -1] * 6, 100)
+        made.append(prepare(one, Arm.panda()))
+    offset = lambda problem: problem.term(TorqueOffset(3), np.array([0.5]))
+    monkeypatch.setattr(
+        premises, "laws", lambda p, log, terms=(): with_terms(p, [offset(p)] * (len(p.traces) < 2))
+    )
+    monkeypatch.setattr(premises, "search", lambda problem, log, state: state)
+    monkeypatch.setattr(premises, "_wider", lambda *_: None)
+    found, state = premises.settled(tuple(made), (True, False), "exact", [])
+    assert found.lasting == (comes_again,)
+    corrected = diagnosis._corrected(
+        Arm.panda(), found, found.background if comes_again else (), state, refitted=True
+    )
+    assert len(corrected.effects) == comes_again
 
 
 @pytest.mark.parametrize("further", [False, True])

@@ -33,7 +33,7 @@ from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .posterior import posterior_of
 from .premises import Premises, settled
-from .problem import FOLDS, Problem
+from .problem import FOLDS, Problem, Term
 from .search import transferable
 from .state import State, with_terms
 from .traces import Trace, trajectory
@@ -193,11 +193,15 @@ def sought(
     contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
     wrong = numbers(problem, state, premises.changes) if contradicted else []
     kept = transferable(problem, laws)
-    correct = lambda by: _corrected(arm, premises, by, refitted=bool(by.terms or wrong))
+    lasting = [t for t, on in zip(premises.background, premises.lasting, strict=True) if on]
+    correct = lambda by: _corrected(arm, premises, lasting, by, refitted=bool(by.terms or wrong))
     corrected = correct(kept)
     moved = [trajectory(recording) for recording in recordings]
-    if worse := misleading(moved, corrected, len(kept.terms)):
-        kept = with_terms(problem, [t for i, t in enumerate(kept.terms) if i not in worse])
+    added = [*(lasting if kept.terms or wrong else ()), *kept.terms]
+    if worse := misleading(moved, corrected, len(added)):
+        gone = {id(added[i]) for i in worse}
+        lasting = [t for t in lasting if id(t) not in gone]
+        kept = with_terms(problem, [t for t in kept.terms if id(t) not in gone])
         corrected = correct(kept)
     lost = [all(t is not k for k in kept.terms) for t in laws.terms]
     fitted = fit(problem, kept)
@@ -215,8 +219,12 @@ def sought(
             kept = with_terms(problem, ())
             corrected, fitted = correct(kept), fit(problem, kept)
         answer = verdict([f for f, on in zip(found, likely, strict=True) if on], fitted, more)
-    if any(lost):
-        dropped = {t.effect.name.replace("_", " ") for t, gone in zip(state.terms, lost, strict=True) if gone}
+    left_out = [
+        *(t for t, gone in zip(state.terms, lost, strict=True) if gone),
+        *(t for t in premises.background if all(t is not k for k in lasting)),
+    ]
+    if left_out:
+        dropped = {t.effect.name.replace("_", " ") for t in left_out}
         notes.append(
             "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
             f" or with all of the motion: {', '.join(sorted(dropped))}"
@@ -404,8 +412,11 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
     return "unexplained" if set(names) == {"unknown"} else "partly_explained"
 
 
-def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) -> Corrected:
-    """The arm with the terms and, where `refitted`, with what they leave of the nuisance."""
+def _corrected(
+    arm: Arm, premises: Premises, lasting: Sequence[Term], state: State, *, refitted: bool
+) -> Corrected:
+    """The arm with the terms and, where `refitted`, with what they leave of the nuisance, of what healthy
+    recordings show only what is `lasting`."""
     problem = premises.problem
     x = state.design.x[: problem.nuisance[0].shape[2]] * (1.0 if refitted else 0.0)
     change, damping, level, rotors = premises.changes(x)
@@ -414,8 +425,9 @@ def _corrected(arm: Arm, premises: Premises, state: State, *, refitted: bool) ->
     values = [jnp.asarray(rotors[j])[None] for j in joints]
     at = len(x) - sum(len(t.deviation) for t in premises.background)
     for term in premises.background if refitted else ():
-        effects.append(term.effect)
-        values.append(jnp.asarray(x[at : at + len(term.deviation)] * term.deviation))
+        if any(term is t for t in lasting):
+            effects.append(term.effect)
+            values.append(jnp.asarray(x[at : at + len(term.deviation)] * term.deviation))
         at += len(term.deviation)
     recorded = [t.channels for t, on in zip(problem.traces, problem.active, strict=True) if on]
     for i, term in enumerate(state.terms):

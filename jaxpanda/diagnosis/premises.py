@@ -21,8 +21,8 @@ from . import knowledge as knowledge_
 from .grid import Grid
 from .noise import Saturation
 from .problem import Problem, Term, posed
-from .search import laws, search
-from .state import State, gains, in_noise, likelier
+from .search import laws, search, transferable
+from .state import State, gains, in_noise, likelier, with_terms
 from .traces import Trace
 
 RUNGS: tuple[tuple[knowledge_.Knowledge, float, float], ...] = (
@@ -47,6 +47,8 @@ class Premises:
     """Multiple of the uncertainty that `knowledge` means."""
     background: tuple[Term, ...] = ()
     """What the healthy recordings show; its columns, each times its deviation, end the nuisance."""
+    lasting: tuple[bool, ...] = ()
+    """Which laws of the background predict torque that they were not fitted to."""
     notes: tuple[str, ...] = ()
 
     def changes(self, x: Float[np.ndarray, " n"]) -> tuple[np.ndarray, ...]:
@@ -85,6 +87,7 @@ def settled(
 ) -> tuple[Premises, State]:
     """Effects found under premises that the recordings do not contradict."""
     background: tuple[Term, ...] = ()
+    lasting: tuple[bool, ...] = ()
     notes: tuple[str, ...] = ()
     healthy = tuple(t for t, on in zip(traces, active, strict=True) if not on)
     if healthy:
@@ -92,9 +95,11 @@ def settled(
         premises, state = settled(healthy, (True,) * len(healthy), knowledge, log, scale, catalogue)
         knowledge, scale, notes = premises.knowledge, premises.scale, premises.notes
         background = tuple(t.law for t in state.terms if not t.effect.bound_to_recording)
+        kept = transferable(premises.problem, with_terms(premises.problem, background))
+        lasting = tuple(any(t is k for k in kept.terms) for t in background)
         log.append("suspect recordings beside them")
     premises = pose(traces, active, knowledge, background, scale=scale, catalogue=catalogue)
-    premises = dataclasses.replace(premises, notes=notes)
+    premises = dataclasses.replace(premises, lasting=lasting, notes=notes)
     premises, state = _stepped(premises, laws(premises.problem, log), laws, log)
     found = search(premises.problem, log, state)
     if found is state:  # other premises have been tried with it
@@ -153,7 +158,8 @@ def _wider(premises: Premises, state: State) -> tuple[Premises, tuple[Term, ...]
     note = f"the recordings contradict that the model's numbers are known as {premises.knowledge!r}"
     # in the place of a step before, which went less far
     others = [one for one in premises.notes if not one.startswith(note)]
-    return dataclasses.replace(best, notes=(*others, f"{note}: they were taken as {told}")), terms
+    notes = (*others, f"{note}: they were taken as {told}")
+    return dataclasses.replace(best, lasting=premises.lasting, notes=notes), terms
 
 
 def _needed(problem: Problem, state: State) -> State:
