@@ -80,6 +80,15 @@ def test_samples_weigh_less_where_motion_is_sharper_than_its_filter():
     assert np.all(trace.trust[jump > 0.4] == 1)
 
 
+def test_stamps_that_are_off_are_no_sharp_motion():
+    """They fill the accelerations of a joint that moves with noise of long tails."""
+    rng = np.random.default_rng(3)
+    t = np.arange(int(6 * RATE)) / RATE
+    late = np.where(rng.random(len(t)) < 0.05, rng.exponential(5e-3, len(t)), 0.0)
+    trace = prepare(moved(0.5 * np.sin(0.5 * np.pi * (t + late))), Arm.panda())
+    assert np.quantile(trace.trust, 0.1) > 0.9
+
+
 def test_a_joint_that_never_moves_tells_nothing():
     """Friction at rest may carry its load."""
     recording = moved(steps())

@@ -54,6 +54,8 @@ _SHAKEN = (2.5, 5.0)
 """Where the bands begin in which noise of q, differentiated twice, may outweigh the motion [Hz]."""
 _SHARPER, _SHARP = 2.5, 6.0
 """Where motion is looked for that a filter took away, in its cutoffs; and how far above noise it must be."""
+_COMMON = 0.9
+"""Share of the samples that show noise alone."""
 _RINGING = 0.2
 """Share of it with which the filter of q still rings a period of its cutoff away."""
 _FROZEN, _MOVES = 0.1, 5.0
@@ -92,8 +94,8 @@ class Trace:
     """Share of its frictionloss at which each joint's friction stands, on the fine grid."""
     trust: Float[np.ndarray, "time dof"]
     """What a sample weighs in each joint, 0 to 1: less where nothing tells which way known friction points, and
-    where the motion is sharper than the filter of q lets through; none where the joint never moves, as friction
-    at rest may carry any part of its load, and none where its torque is stuck."""
+    where the motion is sharper than the filter of q lets through; none where the joint never moves, as
+    friction at rest may carry any part of its load, and none where its torque is stuck."""
     unsure: Float[np.ndarray, "time dof"] | None = None
     """1 where the sign of a joint's velocity cannot be told, else 0: friction at rest may carry any load."""
     stuck: tuple[tuple[int, float, float], ...] = ()
@@ -460,9 +462,11 @@ def _cut_off(
     q: Float[np.ndarray, "time dof"], qdd: Float[np.ndarray, "time dof"], cutoff: float, rate: float
 ) -> Float[np.ndarray, "time dof"]:
     """Acceleration that the filter of q takes away [rad/s²]: where it is far above its noise, and a share of it
-    as long as the filter rings around there; else 0."""
+    as long as the filter rings around there; else 0. Noise is what most samples show, as knocks are rare: what
+    time stamps that are off put into the positions of a joint that moves has long tails.
+    """
     lost = np.abs(continued_derivatives(q, min(_SHARPER * cutoff, 0.4 * rate), rate)[2] - qdd)
-    noise = np.median(lost, axis=0) / 0.6745
+    noise = np.quantile(lost, _COMMON, axis=0) / scipy.special.ndtri((1 + _COMMON) / 2)
     lost = np.where(lost > _SHARP * noise, lost, 0.0)
     near, far = (
         scipy.ndimage.maximum_filter1d(lost, 2 * round(rate * reach) + 1, axis=0)
