@@ -40,7 +40,7 @@ from .errors import InputError, require_x64
 from .friction import Friction
 from .recordings import Recording
 from .signals import Signals, derivatives, prepare, zero_phase
-from .xla import ON_CPU
+from .xla import options
 
 FILE = "validation.json"
 KIND = files.Kind("validate", (FILE,))
@@ -468,7 +468,7 @@ def assert_versions_belong_together(mujoco_version: str, mjx_version: str) -> No
 
 def jit_mjx(function: Callable[..., Any]) -> Callable[..., Any]:
     """`jax.jit`, with what suits MJX on a CPU."""
-    return jax.jit(function, compiler_options=ON_CPU if jax.default_backend() == "cpu" else None)
+    return jax.jit(function, compiler_options=options())
 
 
 def _mjx_inverse(mjx: Any, bare: mujoco.MjModel, q, qd, qdd) -> Float[np.ndarray, "time dof"]:

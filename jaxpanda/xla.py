@@ -1,7 +1,31 @@
 """How XLA compiles large programs for a CPU."""
 
-ON_CPU = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-"""Compiler options. XLA's fusion emitters compute the pose of a link anew wherever MJX uses it, for each link of
-a chain again: inverse dynamics of 100 states takes 0.5 ms with 3 joints, 0.5 s with 7 and 6 s with 9; without
-them 0.4 to 1 ms (`experiments/speed/mjx_on_cpu.py`). The solver of the retrieval compiles in a third of the time
-so, and runs as fast."""
+import functools
+from typing import Any
+
+import jax
+
+_ON_CPU = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+
+
+@functools.cache
+def options(platform: str | None = None) -> dict[str, Any] | None:
+    """Compiler options for MJX, and for other programs as large, on a CPU; None elsewhere, and where XLA does not
+    know them.
+
+    XLA's fusion emitters compute the pose of a link anew wherever MJX uses it, for each link of a chain again:
+    inverse dynamics of 100 states takes 0.5 ms with 3 joints, 0.5 s with 7 and 6 s with 9; without them 0.4 to
+    1 ms (`experiments/speed/mjx_on_cpu.py`). The solver of the retrieval compiles in a third of the time so, and
+    runs as fast.
+
+    Args:
+        platform: "cpu", "gpu", …; that of JAX's default device when None.
+    """
+    if (platform or jax.default_backend()) != "cpu":
+        return None
+    try:
+        with jax.default_device(jax.devices("cpu")[0]):
+            jax.jit(lambda x: x, compiler_options=_ON_CPU).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:  # of another version
+        return None
+    return _ON_CPU

@@ -1,4 +1,4 @@
-"""MJX on a CPU as XLA compiles it by default, and as jaxpanda does (`jaxpanda.xla.ON_CPU`).
+"""MJX on a CPU as XLA compiles it by default, and as jaxpanda does (`jaxpanda.xla.options`).
 
     python mjx_on_cpu.py [--joints N ...] [--states N] [--steps N] [--repeats N]
 
@@ -16,7 +16,7 @@ import mujoco
 from mujoco import mjx
 
 from jaxpanda.versions import version
-from jaxpanda.xla import ON_CPU
+from jaxpanda.xla import options as compiler_options
 
 jax.config.update("jax_enable_x64", True)
 
@@ -86,7 +86,7 @@ def main() -> None:
     )
     print("".join(f"{name:>20}" for name in COLUMNS))
     for joints in args.joints:
-        for name, options in (("default", None), ("jaxpanda", ON_CPU)):
+        for name, options in (("default", None), ("jaxpanda", compiler_options())):
             cells = row(joints, name, options, args.states, args.steps, args.repeats)
             print("".join(f"{c:>20.4g}" if isinstance(c, float) else f"{c:>20}" for c in cells), flush=True)
 

@@ -197,7 +197,8 @@ def sought(
     correct = lambda by: _corrected(arm, premises, lasting, by, refitted=bool(by.terms or wrong))
     corrected = correct(kept)
     moved = [trajectory(recording) for recording in recordings]
-    added = [*(lasting if kept.terms or wrong else ()), *kept.terms]
+    background = premises.background if kept.terms or wrong else ()
+    added = [*(lasting if background else ()), *kept.terms]
     if worse := misleading(moved, corrected, len(added)):
         gone = {id(added[i]) for i in worse}
         lasting = [t for t in lasting if id(t) not in gone]
@@ -221,7 +222,7 @@ def sought(
         answer = verdict([f for f, on in zip(found, likely, strict=True) if on], fitted, more)
     left_out = [
         *(t for t, gone in zip(state.terms, lost, strict=True) if gone),
-        *(t for t in premises.background if all(t is not k for k in lasting)),
+        *(t for t in background if all(t is not k for k in lasting)),
     ]
     if left_out:
         dropped = {t.effect.name.replace("_", " ") for t in left_out}
@@ -415,8 +416,8 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
 def _corrected(
     arm: Arm, premises: Premises, lasting: Sequence[Term], state: State, *, refitted: bool
 ) -> Corrected:
-    """The arm with the terms and, where `refitted`, with what they leave of the nuisance, of what healthy
-    recordings show only what is `lasting`."""
+    """The arm with the terms and, where `refitted`, with what they leave of the nuisance; of what healthy
+    recordings show, with what is `lasting`."""
     problem = premises.problem
     x = state.design.x[: problem.nuisance[0].shape[2]] * (1.0 if refitted else 0.0)
     change, damping, level, rotors = premises.changes(x)
