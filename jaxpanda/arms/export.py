@@ -214,7 +214,7 @@ def _check_geometry(source: MjcfSource, before: Arm, arm: Arm) -> None:
 
 def _inertials_that_count(source: MjcfSource) -> list[markup.Edit]:
     """Refuse compiler settings under which MuJoCo does not take an `inertial` as written. The edits are for a
-    file without any, which needs no `inertiafromgeom`: bodies without one have the inertia of their geoms anyway."""
+    file without any, which needs no `inertiafromgeom`: bodies without one have the inertia of their geoms."""
     elements = list(source.document.root.walk())
     edits = []
     for element in (e for e in elements if e.tag == "compiler"):
