@@ -193,12 +193,12 @@ def sought(
     contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
     wrong = numbers(problem, state, premises.changes) if contradicted else []
     kept = transferable(problem, laws)
-    lasting = [t for t, on in zip(premises.background, premises.lasting, strict=True) if on]
+    background = premises.background if kept.terms or wrong else ()
+    lasting = [t for t, on in zip(premises.background, premises.lasting, strict=True) if background and on]
     correct = lambda by: _corrected(arm, premises, lasting, by, refitted=bool(by.terms or wrong))
     corrected = correct(kept)
     moved = [trajectory(recording) for recording in recordings]
-    background = premises.background if kept.terms or wrong else ()
-    added = [*(lasting if background else ()), *kept.terms]
+    added = [*lasting, *kept.terms]
     if worse := misleading(moved, corrected, len(added)):
         gone = {id(added[i]) for i in worse}
         lasting = [t for t in lasting if id(t) not in gone]
