@@ -80,13 +80,21 @@ def test_samples_weigh_less_where_motion_is_sharper_than_its_filter():
     assert np.all(trace.trust[jump > 0.4] == 1)
 
 
-def test_stamps_that_are_off_are_no_sharp_motion():
-    """They fill the accelerations of a joint that moves with noise of long tails."""
-    rng = np.random.default_rng(3)
+def test_positions_that_jump_are_no_sharp_motion():
+    """Where a row repeats the one before, samples weigh by what the filter leaves of the jump, not by what it
+    takes away."""
     t = np.arange(int(6 * RATE)) / RATE
-    late = np.where(rng.random(len(t)) < 0.05, rng.exponential(5e-3, len(t)), 0.0)
-    trace = prepare(moved(0.5 * np.sin(0.5 * np.pi * (t + late))), Arm.panda())
-    assert np.quantile(trace.trust, 0.1) > 0.9
+    late = np.cumsum(np.arange(len(t)) == len(t) // 2) / RATE
+    arm, truth = Arm.panda(), lambda t: -0.5 * np.pi**2 * np.sin(np.pi * t)
+    trace = prepare(moved(0.5 * np.sin(np.pi * (t - late))), arm)
+    time = trace.motion.time
+    near = np.abs(time - 3) < 0.05
+    off = np.abs(trace.motion.qdd[near] - truth(time[near, None] - (time[near, None] >= 3) / RATE)).max()
+    torque = NOISE * np.sqrt(1 / trace.trust[near] ** 2 - 1)
+    told = (torque / np.abs(trace.motion.mass[near]).sum(2)).max(0)
+    assert np.all(told > 0.5 * off), (told, off)
+    assert np.all(told < 2 * off), (told, off)
+    assert np.all(trace.trust[np.abs(time - 3) > 0.4] == 1)
 
 
 def test_a_joint_that_never_moves_tells_nothing():

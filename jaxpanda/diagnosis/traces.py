@@ -54,8 +54,6 @@ _SHAKEN = (2.5, 5.0)
 """Where the bands begin in which noise of q, differentiated twice, may outweigh the motion [Hz]."""
 _SHARPER, _SHARP = 2.5, 6.0
 """Where motion is looked for that a filter took away, in its cutoffs; and how far above noise it must be."""
-_COMMON = 0.9
-"""Share of the samples that show noise alone."""
 _RINGING = 0.2
 """Share of it with which the filter of q still rings a period of its cutoff away."""
 _FROZEN, _MOVES = 0.1, 5.0
@@ -461,18 +459,26 @@ def _unsure_sign(
 def _cut_off(
     q: Float[np.ndarray, "time dof"], qdd: Float[np.ndarray, "time dof"], cutoff: float, rate: float
 ) -> Float[np.ndarray, "time dof"]:
-    """Acceleration that the filter of q takes away [rad/s²]: where it is far above its noise, and a share of it
-    as long as the filter rings around there; else 0. Noise is what most samples show, as knocks are rare: what
-    time stamps that are off put into the positions of a joint that moves has long tails.
+    """Acceleration that the filtered positions are off by [rad/s²]: what the filter takes away, where that is far
+    above its noise, and a share of it as long as the filter rings around there; else 0.
+
+    Positions that jump, as where a row repeats the one before, are no motion, and what the filter leaves of them
+    is off. Of a jump the acceleration grows as the square of the frequency, from band to band; of the sharpest
+    motion, a velocity that jumps, as the frequency.
     """
-    lost = np.abs(continued_derivatives(q, min(_SHARPER * cutoff, 0.4 * rate), rate)[2] - qdd)
-    noise = np.quantile(lost, _COMMON, axis=0) / scipy.special.ndtri((1 + _COMMON) / 2)
+    sharper = min(_SHARPER, 0.4 * rate / cutoff)
+    low, high = (continued_derivatives(q, min(sharper**k * cutoff, 0.4 * rate), rate)[2] for k in (1, 2))
+    lost, faster = np.abs(low - qdd), np.abs(high - low)
+    noise, hiss = (np.median(x, axis=0) / 0.6745 for x in (lost, faster))
     lost = np.where(lost > _SHARP * noise, lost, 0.0)
-    near, far = (
-        scipy.ndimage.maximum_filter1d(lost, 2 * round(rate * reach) + 1, axis=0)
-        for reach in (2 * _BESIDE, 1 / cutoff)
-    )
-    return np.maximum(near, _RINGING * far)
+
+    def around(x: np.ndarray, reach: float) -> np.ndarray:
+        return scipy.ndimage.maximum_filter1d(x, 2 * round(rate * reach) + 1, axis=0)
+
+    if sharper**2 * cutoff <= 0.4 * rate:
+        jumps = around(faster - _SHARP * hiss, 1 / cutoff) > sharper**1.5 * around(lost, 1 / cutoff)
+        lost = np.where(jumps, lost / (sharper**2 - 1), lost)
+    return np.maximum(around(lost, 2 * _BESIDE), _RINGING * around(lost, 1 / cutoff))
 
 
 def held_sign(
