@@ -2,8 +2,8 @@ r"""Prior odds of what joints have alike.
 
 Gears and motors of an arm are mostly of one make: where a model lacks the friction of one joint it lacks that of
 others. So the share of joints that an effect is at is unknown, and the same for all: with a flat prior over it,
-one more than k of n joints has odds of k : n - k beforehand. The first has the odds of the effect's class. What a
-sensor is off by is its own.
+one more than k of n joints has odds of k : n - k beforehand, n those that move, as the others could not show it.
+The first has the odds of the effect's class. What a sensor is off by is its own.
 
 The curves of friction over speed and load (Stribeck's, a power, the load itself) are each joint's, beside the
 lines that they hold: what lines leave of bristles and warm grease leans the same way in every joint, is no
@@ -23,13 +23,14 @@ TEMPERATURE = 3.0
 quite what it is taken for, and counts as evidence what is none."""
 
 
-def shared(effects: Iterable[AbstractEffect], dof: int) -> float:
-    """By how much likelier several effects are together, beforehand, than the odds of each by itself [nats]."""
+def shared(effects: Iterable[AbstractEffect], joints: int) -> float:
+    """By how much likelier several effects are together, beforehand, than the odds of each by itself, where so
+    many joints could show them [nats]."""
     gained = 0.0
     for of_joints in _by_law(effects).values():
         for k, prior in enumerate(sorted(of_joints.values())[1:], 1):
-            odds = TEMPERATURE * float(np.log(k / (dof - k)))
-            gained += max(min(odds, 0.0) - prior, 0.0)
+            odds = TEMPERATURE * float(np.log(k / max(joints - k, k)))
+            gained += max(odds - prior, 0.0)
     return gained
 
 

@@ -474,6 +474,11 @@ class Problem:
         return Saturation(self.traces)
 
     @functools.cached_property
+    def telling(self) -> int:
+        """How many joints tell of themselves: that move, and of which enough samples count."""
+        return sum(self.saturation.tells(joint) for joint in range(self.dof))
+
+    @functools.cached_property
     def beyond_noise(self) -> list[tuple]:
         """What is beyond each joint's noise beside the last model; the next begins so too."""
         return []

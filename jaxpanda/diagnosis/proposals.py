@@ -49,7 +49,7 @@ def ranked(
         *ripple(problem, design, noise, where),
     ]
     laws = [t.effect for t in design.terms]
-    kept = [at_others(p, laws, problem.dof) for p in before if is_elsewhere(p.effect, where)]
+    kept = [at_others(p, laws, problem.telling) for p in before if is_elsewhere(p.effect, where)]
     events = [p for p in before if p.effect.bound_to_recording]
     likeliest = max((p.evidence for p in scanned), default=0.0)
     if events and likeliest > _AHEAD * max(0.0, *(p.evidence for p in events)):
@@ -63,7 +63,7 @@ def ranked(
         times = 1 + (
             held[p.key[0]] if p.effect.repeats else 0
         )  # the third push is less likely than the first
-        p = at_others(with_prior(p, many[p.key[0]], times), laws, problem.dof)
+        p = at_others(with_prior(p, many[p.key[0]], times), laws, problem.telling)
         if p.key not in best or p.evidence > best[p.key].evidence:
             best[p.key] = p
     first, rest = [], kept
@@ -107,9 +107,9 @@ def with_prior(proposal: Proposal, places: int, times: int = 1) -> Proposal:
     return dataclasses.replace(proposal, evidence=proposal.evidence + prior)
 
 
-def at_others(proposal: Proposal, effects: Sequence[AbstractEffect], dof: int) -> Proposal:
-    """A proposal with what effects at other joints say of it beforehand."""
-    gained = shared((*effects, proposal.effect), dof) - shared(effects, dof)
+def at_others(proposal: Proposal, effects: Sequence[AbstractEffect], joints: int) -> Proposal:
+    """A proposal with what effects at other joints say of it beforehand, of so many that could show it."""
+    gained = shared((*effects, proposal.effect), joints) - shared(effects, joints)
     evidence = proposal.evidence - proposal.shared + gained
     return dataclasses.replace(proposal, evidence=evidence, shared=gained)
 

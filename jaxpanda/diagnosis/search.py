@@ -133,14 +133,14 @@ def choices(
     if not proposals:
         return []
     laws, out = [t.effect for t in terms], []
-    own = evidence(problem, terms, design, noise) + shared(laws, problem.dof)
+    own = evidence(problem, terms, design, noise) + shared(laws, problem.telling)
     for p in _likeliest(proposals):
         for form in (p, *plainer(problem, design, noise, p)):
             term = taken(problem, design, noise, form)
             more = problem.design((*terms, term), noise)
             if is_possible(problem.arm, term, more):
                 found = evidence(problem, (*terms, term), more, noise)
-                paid = term.prior + shared((*laws, term.effect), problem.dof)
+                paid = term.prior + shared((*laws, term.effect), problem.telling)
                 out.append((found - own + paid, (term,)))
             problem.forget(term)
     return sorted(out, key=lambda choice: -choice[0])
@@ -403,7 +403,7 @@ def everywhere(problem: Problem, noise: Noise) -> list[Term]:
             left = [g for g in groups if (g.name, g.effects[0].joints) not in held]
             found = []
             for p in grids(problem, design, noise, left) if left else []:
-                p = at_others(with_prior(p, problem.dof), [t.effect for t in terms], problem.dof)
+                p = at_others(with_prior(p, problem.dof), [t.effect for t in terms], problem.telling)
                 p = refine(problem, design, noise, p)
                 found += choices(problem, terms, design, noise, [p]) if p.evidence > 0 else []
             best = max(found, key=lambda choice: choice[0], default=None)

@@ -20,6 +20,8 @@ class State:
     terms: tuple[Term, ...]
     noise: Noise
     design: Design
+    joints: int
+    """How many tell of themselves."""
 
     @functools.cached_property
     def shares(self) -> Float[np.ndarray, "terms dof"]:
@@ -41,7 +43,7 @@ class State:
             here = r != 0
             counted += 0.5 * float(r @ r) + np.count_nonzero(here) * float(np.log(self.noise.sigma[j]))
             counted += self.noise.widened(j, here)
-        return self.design.log_evidence - counted + paid(self.terms, len(self.noise.std))
+        return self.design.log_evidence - counted + paid(self.terms, self.joints)
 
 
 def start(problem: Problem) -> State:
@@ -178,7 +180,7 @@ def _responses(dt: float, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def in_noise(problem: Problem, terms: Sequence[Term], noise: Noise) -> State:
     """The model with these terms, in some noise."""
-    return State(tuple(terms), noise, problem.design(terms, noise))
+    return State(tuple(terms), noise, problem.design(terms, noise), problem.telling)
 
 
 def places(state: State) -> list[slice]:
@@ -203,13 +205,13 @@ def beside(problem: Problem, state: State, which: Collection[int], rest: Design)
     """Log evidence of the model without some of its terms, `rest`, less their priors: what the whole must exceed
     for them to be worth it."""
     others = [t for i, t in enumerate(state.terms) if i not in which]
-    less = paid(others, problem.dof) - paid(state.terms, problem.dof)
+    less = paid(others, state.joints) - paid(state.terms, state.joints)
     return evidence(problem, others, rest, state.noise) + less
 
 
-def paid(terms: Sequence[Term], dof: int) -> float:
+def paid(terms: Sequence[Term], joints: int) -> float:
     """Log prior odds of these terms together, less what the search for their shapes has cost [nats]."""
-    return sum(t.prior for t in terms) + shared([t.effect for t in terms], dof)
+    return sum(t.prior for t in terms) + shared([t.effect for t in terms], joints)
 
 
 def evidence(problem: Problem, terms: Sequence[Term], design: Design, noise: Noise) -> float:

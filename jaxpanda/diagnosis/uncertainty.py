@@ -110,7 +110,7 @@ def _moved(problem: Problem, state: State, near: Linearised, step: Float[np.ndar
         _reshaped(problem, t, within(problem, moved(t.effect, steps[i]))) if i in steps else t
         for i, t in enumerate(state.terms)
     ]
-    return State(tuple(terms), state.noise, problem.design(terms, state.noise))
+    return State(tuple(terms), state.noise, problem.design(terms, state.noise), state.joints)
 
 
 def _reshaped(problem: Problem, term: Term, effect: AbstractEffect) -> Term:
