@@ -33,6 +33,13 @@ def test_the_first_joint_pays_in_full_and_each_further_one_less(law):
     assert told[-1] == 0.0  # never likelier beforehand than not: what nothing shows is not there
 
 
+def test_of_fewer_joints_that_could_show_a_law_one_more_is_likelier():
+    one, more = CoulombFriction(0, 0.01), CoulombFriction(3, 0.01)
+    gained = [shared((one, more), joints) for joints in (7, 4, 3, 2)]
+    assert all(a < b for a, b in itertools.pairwise(gained))
+    assert gained[-1] == -CoulombFriction.prior  # the only other joint that moves has it
+
+
 def test_the_order_in_which_joints_are_found_does_not_matter():
     effects = [
         CoulombFriction(0, 0.01),

@@ -261,6 +261,11 @@ def test_a_force_that_every_repeat_of_the_motion_shows_is_no_event(again):
     assert is_of_time(problem, state.design, state.noise, push) is not again
 
 
+def test_joints_that_never_move_tell_nothing_of_themselves():
+    assert posed(record(5)).telling == 7
+    assert posed(record(5, still=(0, 1, 3, 5, 6))).telling == 2
+
+
 def test_of_two_models_the_one_with_the_law_is_likelier_whichever_comes_first():
     rubs = lambda t, q, qd, qdd: 0.5 * qd[:, [2]] * np.eye(7)[2]
     problem = posed(record(5, rubs))
