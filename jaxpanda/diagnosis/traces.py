@@ -466,18 +466,17 @@ def _cut_off(
     is off. Of a jump the acceleration grows as the square of the frequency, from band to band; of the sharpest
     motion, a velocity that jumps, as the frequency.
     """
-    sharper = min(_SHARPER, 0.4 * rate / cutoff)
-    low, high = (continued_derivatives(q, min(sharper**k * cutoff, 0.4 * rate), rate)[2] for k in (1, 2))
-    lost, faster = np.abs(low - qdd), np.abs(high - low)
-    noise, hiss = (np.median(x, axis=0) / 0.6745 for x in (lost, faster))
-    lost = np.where(lost > _SHARP * noise, lost, 0.0)
-
-    def around(x: np.ndarray, reach: float) -> np.ndarray:
-        return scipy.ndimage.maximum_filter1d(x, 2 * round(rate * reach) + 1, axis=0)
-
-    if sharper**2 * cutoff <= 0.4 * rate:
-        jumps = around(faster - _SHARP * hiss, 1 / cutoff) > sharper**1.5 * around(lost, 1 / cutoff)
-        lost = np.where(jumps, lost / (sharper**2 - 1), lost)
+    acceleration = lambda below: continued_derivatives(q, min(below, 0.4 * rate), rate)[2]
+    noise = lambda x: np.median(x, axis=0) / 0.6745
+    around = lambda x, reach: scipy.ndimage.maximum_filter1d(x, 2 * round(rate * reach) + 1, axis=0)
+    sharper = acceleration(_SHARPER * cutoff)
+    lost = np.abs(sharper - qdd)
+    lost = np.where(lost > _SHARP * noise(lost), lost, 0.0)
+    if _SHARPER**2 * cutoff <= 0.4 * rate:
+        above = np.abs(acceleration(_SHARPER**2 * cutoff) - sharper)
+        grown = around(above - _SHARP * noise(above), 1 / cutoff)
+        jumps = grown > _SHARPER**1.5 * around(lost, 1 / cutoff)
+        lost = np.where(jumps, lost / (_SHARPER**2 - 1), lost)
     return np.maximum(around(lost, 2 * _BESIDE), _RINGING * around(lost, 1 / cutoff))
 
 
