@@ -212,7 +212,7 @@ def test_white_noise_is_likeliest_in_its_own_deviation():
     for sigma in (0.2, 0.3, 0.45):
         design = Design([np.zeros((4000, 0))], [x / sigma], np.zeros(0))
         noise = Noise(np.zeros((1, 3)), np.array([sigma]), np.array([sigma]))
-        found[sigma] = State((), noise, design).score
+        found[sigma] = State((), noise, design, 1).score
     assert max(found, key=lambda s: found[s]) == 0.3
     density = {s: -0.5 * np.sum(x**2) / s**2 - 4000 * np.log(s) for s in found}
     for s in found:
@@ -227,7 +227,7 @@ def test_samples_of_which_laws_tell_less_are_worth_what_they_are_likely_in_their
     for name, trust in (("right", 1 / width), ("wrong", width / 2), ("all", np.ones(2000))):
         design = Design([np.zeros((2000, 0))], [x * trust], np.zeros(0))
         noise = Noise(np.zeros((1, 3)), np.ones(1), np.ones(1), trust[:, None])
-        score[name] = State((), noise, design).score
+        score[name] = State((), noise, design, 1).score
     assert score["right"] > score["all"] + 100
     assert score["all"] > score["wrong"] + 100
 
@@ -243,7 +243,7 @@ def test_what_a_rest_holds_is_one_number_however_many_samples_it_lasts(unresolve
     stays = np.full((count, 1), variance)
     trust = 1 / np.sqrt(1 + unresolved + stays)
     noise = Noise(np.zeros((1, 3)), np.ones(1), np.ones(1), trust, stays, quiet=np.array([quiet]))
-    score = State((), noise, Design([np.zeros((count, 0))], [x * trust[:, 0]], np.zeros(0))).score
+    score = State((), noise, Design([np.zeros((count, 0))], [x * trust[:, 0]], np.zeros(0)), 1).score
     wide = (1 + unresolved) * np.eye(count) + variance
     exact = -0.5 * (x @ np.linalg.solve(wide, x) + np.linalg.slogdet(wide)[1])
     assert score == pytest.approx(exact, abs=10)
