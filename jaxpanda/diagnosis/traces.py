@@ -92,8 +92,8 @@ class Trace:
     """Share of its frictionloss at which each joint's friction stands, on the fine grid."""
     trust: Float[np.ndarray, "time dof"]
     """What a sample weighs in each joint, 0 to 1: less where nothing tells which way known friction points, and
-    where the motion is sharper than the filter of q lets through; none where the joint never moves, as friction
-    at rest may carry any part of its load, and none where its torque is stuck."""
+    where the motion is sharper than the filter of q lets through or its positions jump; none where the joint
+    never moves, as friction at rest may carry any part of its load, and none where its torque is stuck."""
     unsure: Float[np.ndarray, "time dof"] | None = None
     """1 where the sign of a joint's velocity cannot be told, else 0: friction at rest may carry any load."""
     stuck: tuple[tuple[int, float, float], ...] = ()
