@@ -152,6 +152,12 @@ def _wrapped(cells: list[list[str]]) -> str:
     return text(cells)
 
 
+def _reset(cells: list[list[str]]) -> str:
+    for row in cells[50:]:
+        row[2] = repr(float(row[2]) + 0.3)
+    return text(cells)
+
+
 BAD = {
     "not a number": (_cell(7, 2, "nan"), r"column q_2, row 7 \(line 8\): the value is nan"),
     "infinite": (_cell(9, 5, "inf"), r"column tau_1, row 9 \(line 10\): the value is inf"),
@@ -183,6 +189,10 @@ BAD = {
     "a wrapped angle": (
         _wrapped,
         r"column q_1, row \d+ \(line \d+\): the angle jumps by a turn.*numpy.unwrap",
+    ),
+    "an encoder that was reset": (
+        _reset,
+        r"column q_2 jumps from \S+ rad to \S+ rad at 0.49 s and stays there.*--to, --from",
     ),
     "degrees per second": (_scaled(slice(3, 5), 180 / np.pi), "dq looks like degrees per second"),
     "no torque of a joint": (
@@ -235,6 +245,16 @@ def test_a_gap_in_which_a_joint_turns_on_is_no_jump(tmp_path):
     cut = Recording("cut", made.time[keep], made.q[keep], None, None)
     save(cut, tmp_path / "cut.csv")
     assert same(load(tmp_path / "cut.csv"), cut)
+
+
+def test_a_position_that_is_written_late_does_not_jump(tmp_path):
+    made = recording(samples=1000, rate=1000.0)
+    q = 20 * made.q
+    q[400:420] = q[400]
+    assert np.abs(np.diff(q, axis=0)).max() > 0.1
+    late = Recording("late", made.time, q, None, made.tau)
+    save(late, tmp_path / "late.csv")
+    assert same(load(tmp_path / "late.csv"), late)
 
 
 def test_line_numbers_count_blank_lines(tmp_path):

@@ -22,10 +22,16 @@ _WRAPS = 0.5
 """How far from a whole turn the jump of a wrapped angle is [rad]: what the joint turns from row to row."""
 _LEAPS = 30.0
 """Speed beyond which it is a jump, where rows are missing [rad/s]."""
+_RESETS = 0.05
+"""How far a position that jumps does so, at least [rad]."""
+_STAYS = 0.1
+"""How long it is there then, at least [s]."""
+_APART = 3.0
+"""How many times faster than the rows beside it."""
 _TRAVELS = 0.5
 """How far a joint moves that says which unit positions are in [rad]."""
 _FASTEST = 10.0
-"""Speed that a joint which turns on reaches at most [rad/s]."""
+"""Speed that a joint reaches at most, from one row to the next or where it turns on [rad/s]."""
 
 
 def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Recording:
@@ -46,6 +52,7 @@ def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Re
     _unwrapped(recording, row)
     recording = without_glitches(recording)
     _units(recording)
+    _continuous(recording)
     return on_clock(recording)
 
 
@@ -58,6 +65,7 @@ def plausible(recording: Recording) -> Recording:
     _rate(recording)
     _unwrapped(recording, lambda i: f"row {i + 1}")
     _units(recording)
+    _continuous(recording)
     return recording
 
 
@@ -110,6 +118,31 @@ def _unwrapped(recording: Recording, row: Callable[[int], str]) -> None:
             f"{after:.4g} rad; {int(jumps.sum())} such jumps in all), where positions must be continuous: unwrap "
             "them, as numpy.unwrap(q, axis=0) does"
         )
+
+
+def _continuous(recording: Recording) -> None:
+    """No position jumps, and stays there, between two rows, as where an encoder was reset while the log ran on.
+
+    A joint that comes there within what has passed since its position last changed has turned: rows were lost.
+    """
+    every = float(np.median(np.diff(recording.time)))
+    stays = max(1, round(_STAYS / every))
+    for j, q in enumerate(recording.q.T):
+        at = np.flatnonzero(np.diff(q)) + 1
+        step, elapsed = np.diff(q)[at - 1], np.diff(recording.time[np.r_[0, at]])
+        speed = np.abs(step) / np.maximum(elapsed, every)
+        fast = np.flatnonzero((np.abs(step) > _RESETS) & (speed > _FASTEST))
+        for k in fast:
+            beside = speed[max(0, k - 2) : k + 3]
+            usual = np.sort(beside)[-2] if len(beside) > 1 else 0.0
+            i = int(at[k])
+            after = q[i : i + stays] - q[i - 1]
+            if speed[k] > _APART * usual and np.all(after / step[k] > 0.5):
+                raise InputError(
+                    f"{recording.name}: column q_{j + 1} jumps from {q[i - 1]:.4g} rad to {q[i]:.4g} rad at "
+                    f"{recording.time[i]:.6g} s and stays there, as where an encoder is reset while the log runs "
+                    "on, where positions must be continuous: read one side of it (--to, --from), or record again"
+                )
 
 
 def _radians(recording: Recording) -> None:
