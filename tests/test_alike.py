@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxpanda.diagnosis.alike import TEMPERATURE, shared
+from jaxpanda.diagnosis.alike import TEMPERATURE, one_more, shared
 from jaxpanda.effects.drive import Armature, JointSpring
 from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
@@ -84,3 +84,23 @@ def test_a_curve_is_shared_as_far_as_its_lines_are():
 
 def test_the_same_joint_twice_is_no_second_joint():
     assert shared([CoulombFriction(2, 0.01), StribeckFriction(2, 0.05, 0.01, 2.0, form="whole")], DOF) == 0.0
+
+
+def test_one_more_effect_is_worth_what_it_adds_to_all():
+    everything = [
+        *(CoulombFriction(j, 0.01) for j in (0, 2, 3)),
+        *(StribeckFriction(j, 0.05, 0.01, 2.0, form="whole") for j in (2, 4)),
+        *(
+            PreslidingHysteresis(j, x, form)
+            for j, x, form in ((0, 0.05, "dahl only"), (4, 1e-3, "dahl whole"))
+        ),
+        TorqueOffset(3),
+        Armature(5),
+    ]
+    for count in range(len(everything)):
+        held = everything[:count]
+        beside = one_more(held, DOF)
+        for effect in everything:
+            assert beside(effect) == pytest.approx(
+                shared((*held, effect), DOF) - shared(held, DOF), abs=1e-12
+            )

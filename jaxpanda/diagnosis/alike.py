@@ -12,7 +12,7 @@ shared.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
@@ -26,11 +26,31 @@ quite what it is taken for, and counts as evidence what is none."""
 def shared(effects: Iterable[AbstractEffect], joints: int) -> float:
     """By how much likelier several effects are together, beforehand, than the odds of each by itself, where so
     many joints could show them [nats]."""
+    return float(sum(_gained(of_joints, joints) for of_joints in _by_law(effects).values()))
+
+
+def one_more(effects: Iterable[AbstractEffect], joints: int) -> Callable[[AbstractEffect], float]:
+    """By how much likelier another effect is, beforehand, beside these than by itself [nats]: what it adds to
+    `shared`."""
+    held = _by_law(effects)
+
+    def gained(effect: AbstractEffect) -> float:
+        out = 0.0
+        for law, own in _by_law([effect]).items():
+            before = held.get(law, {})
+            after = before | {joint: min(prior, before.get(joint, 0.0)) for joint, prior in own.items()}
+            out += _gained(after, joints) - _gained(before, joints)
+        return out
+
+    return gained
+
+
+def _gained(of_joints: Mapping[int, float], joints: int) -> float:
+    """By how much likelier a law is together, given its prior at each joint that has it."""
     gained = 0.0
-    for of_joints in _by_law(effects).values():
-        for k, prior in enumerate(sorted(of_joints.values())[1:], 1):
-            odds = TEMPERATURE * float(np.log(k / max(joints - k, k)))
-            gained += max(odds - prior, 0.0)
+    for k, prior in enumerate(sorted(of_joints.values())[1:], 1):
+        odds = TEMPERATURE * float(np.log(k / max(joints - k, k)))
+        gained += max(odds - prior, 0.0)
     return gained
 
 

@@ -2,12 +2,12 @@
 
 import dataclasses
 from collections import Counter, defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
 from ..effects import AbstractEffect, AbstractJointEffect
-from .alike import shared
+from .alike import one_more
 from .credible import is_credible
 from .events import Proposal, ripple, spots, windows
 from .evidence import Design, Noise, log_mean_exp
@@ -48,8 +48,8 @@ def ranked(
         *spots(problem, design, noise, where),
         *ripple(problem, design, noise, where),
     ]
-    laws = [t.effect for t in design.terms]
-    kept = [at_others(p, laws, problem.telling) for p in before if is_elsewhere(p.effect, where)]
+    beside = one_more([t.effect for t in design.terms], problem.telling)
+    kept = [at_others(p, beside) for p in before if is_elsewhere(p.effect, where)]
     events = [p for p in before if p.effect.bound_to_recording]
     likeliest = max((p.evidence for p in scanned), default=0.0)
     if events and likeliest > _AHEAD * max(0.0, *(p.evidence for p in events)):
@@ -63,7 +63,7 @@ def ranked(
         times = 1 + (
             held[p.key[0]] if p.effect.repeats else 0
         )  # the third push is less likely than the first
-        p = at_others(with_prior(p, many[p.key[0]], times), laws, problem.telling)
+        p = at_others(with_prior(p, many[p.key[0]], times), beside)
         if p.key not in best or p.evidence > best[p.key].evidence:
             best[p.key] = p
     first, rest = [], kept
@@ -107,9 +107,9 @@ def with_prior(proposal: Proposal, places: int, times: int = 1) -> Proposal:
     return dataclasses.replace(proposal, evidence=proposal.evidence + prior)
 
 
-def at_others(proposal: Proposal, effects: Sequence[AbstractEffect], joints: int) -> Proposal:
-    """A proposal with what effects at other joints say of it beforehand, of so many that could show it."""
-    gained = shared((*effects, proposal.effect), joints) - shared(effects, joints)
+def at_others(proposal: Proposal, beside: Callable[[AbstractEffect], float]) -> Proposal:
+    """A proposal with what the effects `beside` it say of it beforehand."""
+    gained = beside(proposal.effect)
     evidence = proposal.evidence - proposal.shared + gained
     return dataclasses.replace(proposal, evidence=evidence, shared=gained)
 

@@ -13,7 +13,7 @@ import scipy.special
 
 from ..arms.arm import Arm
 from ..effects import AbstractJointEffect
-from .alike import TEMPERATURE, joints_with, shared
+from .alike import TEMPERATURE, joints_with, one_more, shared
 from .credible import fitted
 from .events import Proposal
 from .evidence import Design, Noise
@@ -401,9 +401,9 @@ def everywhere(problem: Problem, noise: Noise) -> list[Term]:
             design = problem.design(terms, noise)
             held = {t.key for t in terms}
             left = [g for g in groups if (g.name, g.effects[0].joints) not in held]
-            found = []
+            found, beside_it = [], one_more([t.effect for t in terms], problem.telling)
             for p in grids(problem, design, noise, left) if left else []:
-                p = at_others(with_prior(p, problem.dof), [t.effect for t in terms], problem.telling)
+                p = at_others(with_prior(p, problem.dof), beside_it)
                 p = refine(problem, design, noise, p)
                 found += choices(problem, terms, design, noise, [p]) if p.evidence > 0 else []
             best = max(found, key=lambda choice: choice[0], default=None)
