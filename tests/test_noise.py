@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
@@ -13,6 +14,7 @@ from jaxpanda import Arm, InputError, Recording
 from jaxpanda.diagnosis import diagnose
 from jaxpanda.diagnosis.diagnosis import _unheard
 from jaxpanda.diagnosis.evidence import Noise, levelled
+from jaxpanda.diagnosis.noise import borne_out
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.state import _levelled_squares, beyond, slow_errors, start
 from jaxpanda.diagnosis.traces import prepare
@@ -172,3 +174,28 @@ def test_an_arm_is_quieter_at_rest_where_it_is():
         found[share] = pose((prepare(recording, ARM),), (True,), "exact").problem.noise(()).quiet
     np.testing.assert_allclose(found[1.0], 1.0, rtol=0.2)
     assert np.all(found[0.3] < 0.5)  # 0.14 of what all have, but for reversals, where nobody is quiet
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.01, 0.1, 1.0])
+def test_what_laws_are_off_from_sample_to_sample_is_as_much_as_innovations_show(share):
+    rng = np.random.default_rng(0)
+    off = 300 * np.sin(np.linspace(0, 40, 20_000)) ** 2
+    left = rng.normal(size=len(off)) * np.sqrt(1 + share * off)
+    told, deviation = borne_out(left, off, np.ones(len(off)))
+    assert told == share
+    assert deviation * np.std(left) == pytest.approx(1.0, rel=0.03)
+
+
+@pytest.mark.parametrize("off", [3.0, 3.0 * np.sin(np.linspace(0, 40, 100)) ** 2])
+def test_white_noise_bears_out_nothing_that_laws_are_off(off):
+    rng = np.random.default_rng(1)
+    told = [borne_out(rng.normal(size=100), off * np.ones(100), np.ones(100))[0] for _ in range(400)]
+    assert np.mean(np.array(told) > 0) < 0.05
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_friction_that_the_model_has_too_much_of_is_no_noise(seed):
+    """Went wrong: of what it left at reversals 17 times the noise was taken for noise."""
+    rubs = dataclasses.replace(ARM, frictionloss=jnp.full(ARM.dof, 20.0))
+    noise = pose((prepare(still_right(6.0, seed), rubs),), (True,), "exact").problem.noise(())
+    assert noise.std == pytest.approx(noise_of(6.0, seed).std, rel=0.05)

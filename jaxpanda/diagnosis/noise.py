@@ -9,6 +9,7 @@ at the price of its degrees of freedom.
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -26,6 +27,8 @@ DETAILS = (1.0, 0.6, 0.35, 0.2)
 QUIETEST = 1e-9
 """Noise is taken for at least this [N m]."""
 _RANK = 1e-6  # least singular value that counts, as a share of the largest
+_SHARES = (0.0, 0.001, 0.01, 0.1, 1.0)
+"""Of the variance of what laws may be off from sample to sample, those that are told apart."""
 
 
 def hats(x: Float[np.ndarray, " _time"], count: int) -> Float[np.ndarray, "_time _count"]:
@@ -58,6 +61,23 @@ class _Basis:
     @property
     def tells(self) -> bool:
         return self.free > max(LEAST_FREE * self.count, FEWEST_FREE)
+
+
+class JointNoise(NamedTuple):
+    """What a saturated model leaves of a joint."""
+
+    a: Float[np.ndarray, " order"]
+    """Of the autoregression."""
+    sigma: float
+    """Deviation of the innovations, beside what laws are off [N m]."""
+    std: float
+    """Of all that is left [N m]."""
+    quiet: float
+    """Mean square of the innovations at rest, over that of all: an arm at rest is mostly quieter."""
+    share: float
+    """How much of the variance of what laws may be off from sample to sample the innovations bear out."""
+    beside: float
+    """Deviation of the noise, beside what laws are off [N m]."""
 
 
 class Saturation:
@@ -99,10 +119,16 @@ class Saturation:
         smooth = [rigid, shaken, hats(q, knots(10)), speed, hats(load, knots(5)), swings, clock]
         rough = [sign[:, None] * x for x in (speed, hats(q, knots(4)), hats(load, knots(3)), clock[:, ::2])]
         turned = turning(traces, joint)
+        known = [stacked(lambda t: t.down(t.sign[:, joint]))[:, None]] if self._rubs(joint) else []
         A = np.concatenate(
-            [*smooth, *rough, turned, *([np.concatenate(list(extra))] if len(extra) else [])], 1
+            [*smooth, *rough, turned, *known, *([np.concatenate(list(extra))] if len(extra) else [])], 1
         )
         return A * self._weight(joint)[:, None]
+
+    def _rubs(self, joint: int) -> bool:
+        """Whether the user's model has dry friction there, which turns as MuJoCo's constraint does; there may be
+        less of it."""
+        return bool(np.asarray(self.traces[0].motion.arm.frictionloss)[joint] > 0)
 
     def left(
         self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]] = ()
@@ -127,9 +153,17 @@ class Saturation:
         joint: int,
         extra: Sequence[Float[np.ndarray, "_time _n"]],
         rests: Float[np.ndarray, " _rows"],
-    ) -> tuple[np.ndarray, float, float, float]:
-        r"""`autoregression` of what the model with `extra` columns leaves, with what it took of noise put back;
-        and the mean square of the innovations in `rests`, over that of all: an arm at rest is mostly quieter.
+        off: Float[np.ndarray, " _rows"],
+        holds: Float[np.ndarray, " _rows"],
+    ) -> JointNoise:
+        r"""`autoregression` of what the model with `extra` columns leaves, with what it took of noise put back.
+
+        Args:
+            joint: whose.
+            extra: columns in each recording.
+            rests: where the joint does, 0 to 1.
+            off: variance of what laws may be off from sample to sample [N² m²].
+            holds: that of a load which friction may hold: nothing is borne out there.
 
         Of white noise of variance $\sigma^2$ a model with orthonormal columns U takes
         $\sigma^2 \sum_t U_{t-k} \cdot U_{t-l}$ of the moment of lags k and l: most where it is slow.
@@ -142,9 +176,12 @@ class Saturation:
         a, sigma, std = autoregression(self.moments(r[:, None]) + variance * taken, count)
         b = np.concatenate([[1.0], -a])
         left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)]) / sigma
+        counts = self._weight(joint) ** 2 * (left != 0) * (holds == 0)
+        share, scale = borne_out(left, off / std**2, counts)
+        left /= scale * np.sqrt(1 + share * off / std**2)
         free = rests * (1 - sum(np.sum(U**2, 1) for U in bases))
         quiet = (rests @ left**2 + FEWEST_FREE) / (np.sum(free) + FEWEST_FREE)
-        return a, sigma, std, float(quiet)
+        return JointNoise(a, sigma * scale, std, float(quiet), share * scale**2, std * scale)
 
     def tells(self, joint: int) -> bool:
         """Whether the recordings are long enough for the model to leave noise of a joint to be seen."""
@@ -204,6 +241,31 @@ class Saturation:
         for trace in self.traces:  # made once, before there are threads
             trace.motion.regressor, trace.motion.load, trace.shaken  # noqa: B018
         return parallel(one, range(self.traces[0].motion.dof))
+
+
+def borne_out(
+    left: Float[np.ndarray, " rows"], off: Float[np.ndarray, " rows"], counts: Float[np.ndarray, " rows"]
+) -> tuple[float, float]:
+    r"""How much of an error from sample to sample innovations bear out, and their deviation beside it, over that
+    of all.
+
+    Of variance $\sigma^2 (1 + s\,o_t)$ the least s than which none is likelier by what a number of its own is
+    worth (Schwarz 1978).
+
+    Args:
+        left: innovations, times the root of what their rows count.
+        off: variance $o_t$ of the error, over that of the innovations.
+        counts: how much each row does, 0 to 1.
+    """
+    count = float(np.sum(counts))
+    if count < 1:
+        return _SHARES[0], 1.0
+    squares = np.where(counts > 0, left, 0.0) ** 2
+    spread = [1 + share * off for share in _SHARES]
+    variance = np.maximum([np.sum(squares / x) for x in spread], 1e-300)
+    nats = -0.5 * (count * np.log(variance) + [counts @ np.log(x) for x in spread])
+    least = int(np.argmax(nats > nats.max() - 0.5 * np.log(count)))
+    return _SHARES[least], float(np.sqrt(variance[least] / variance[0]))
 
 
 def strongest_order(

@@ -22,7 +22,7 @@ from .evidence import Columns, Design, Noise
 from .grid import Grid
 from .host import parallel
 from .library import Candidates
-from .noise import ORDER, QUIETEST, Saturation
+from .noise import ORDER, QUIETEST, JointNoise, Saturation
 from .scan import Block, Family, Score, Whitened, families, projected, scan
 from .traces import Trace
 
@@ -484,17 +484,18 @@ class Problem:
         return []
 
     @functools.cached_property
-    def _noises(self) -> dict[tuple, tuple]:
+    def _noises(self) -> dict[tuple, tuple[JointNoise, list[Term]]]:
         return {}
 
     def noise(self, terms: Sequence[Term]) -> Noise:
         """Noise that a saturated model with these terms leaves; of a joint it depends on what acts there."""
 
-        def one(joint: int) -> tuple:
+        def one(joint: int) -> JointNoise:
             if joint not in heard:
                 taus = [t.signals.tau for t in self.traces if t.signals.tau is not None]
                 white = float(np.median([signals_.white_noise(tau)[joint] for tau in taus]))
-                return np.zeros(ORDER), _UNHEARD, max(white, QUIETEST), 1.0
+                quietest = max(white, QUIETEST)
+                return JointNoise(np.zeros(ORDER), _UNHEARD, quietest, 1.0, 1.0, quietest)
             here = [t for t in (*self.background, *terms) if t.acts[joint]]
             key = joint, *(id(t) for t in here)
             if key not in self._noises:
@@ -502,9 +503,10 @@ class Problem:
                     np.concatenate([ripples[joint][r], *(t.columns[r][:, joint] for t in here)], 1)
                     for r in range(len(self.traces))
                 ]
-                found = self.saturation.noise(joint, extra, rows_at_rest[:, joint])
-                self._noises[key] = (*found, here)  # keeps what it names alive
-            return self._noises[key][:4]
+                spread = rows_at_rest[:, joint], off[:, joint], rests[:, joint]
+                found = self.saturation.noise(joint, extra, *spread)
+                self._noises[key] = found, here  # keeps what it names alive
+            return self._noises[key][0]
 
         ripples, rows_at_rest = self.saturation.ripples, self._at_rest  # made once, before there are threads
         heard = {j for j in range(self.dof) if self.saturation.tells(j)}
@@ -517,10 +519,10 @@ class Problem:
                 " physics from noise; record longer, or more motion: of seven joints that move all the time"
                 " 2 s at 100 Hz or more are enough"
             )
-        a, sigma, std, quiet = zip(*parallel(one, range(self.dof)), strict=True)
         off = self._known_unresolved + sum(t.unresolved for t in terms if t.unresolved is not None)
         rests = np.zeros_like(off) + sum(t.at_rest for t in terms if t.at_rest is not None)
-        off, rests, known = (x / np.square(std) for x in (off, rests, self._known_at_rest))
+        a, sigma, std, quiet, share, beside = zip(*parallel(one, range(self.dof)), strict=True)
+        off, rests, known = (x / np.square(beside) for x in (off * share, rests, self._known_at_rest))
         trust = 1 / np.sqrt(1 + off + rests)
         return Noise(
             np.stack(a), np.array(sigma), np.array(std), trust, rests, rests + known, quiet=np.array(quiet)

@@ -70,7 +70,7 @@ class TorqueGain(AbstractInstantEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("gain_error", "1"),)
+        return (Coefficient("gain_error", "1", scale=0.1),)
 
     @property
     def equation(self) -> str:
@@ -191,7 +191,7 @@ class TorqueCrosstalk(AbstractInstantEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient(f"crosstalk_from_{int(self.source) + 1}", "1"),)
+        return (Coefficient(f"crosstalk_from_{int(self.source) + 1}", "1", scale=0.1),)
 
     @property
     def equation(self) -> str:
