@@ -367,9 +367,16 @@ def _parts(
 
 
 def _new(terms: Sequence[Term], proposals: Sequence[Proposal], free: bool) -> list[Proposal]:
-    """Proposals that may join these terms: free forms too, or laws only."""
+    """Proposals that may join these terms: free forms too, or laws only. One of them corrects a number of the
+    user's model."""
     held = {t.key for t in terms}
-    return [p for p in proposals if (p.key not in held or p.effect.repeats) and (free or not p.effect.free)]
+    numbers = {(c.beyond, t.effect.joints) for t in terms for c in t.effect.coefficients if c.beyond}
+    known = lambda effect: all((c.beyond, effect.joints) in numbers for c in effect.coefficients)
+    return [
+        p
+        for p in proposals
+        if (p.key not in held or p.effect.repeats) and (free or not p.effect.free) and not known(p.effect)
+    ]
 
 
 def posterior(problem: Problem, state: State, i: int) -> dict[str, float]:

@@ -71,7 +71,7 @@ class ViscousFriction(AbstractInstantEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("damping", "N·m·s/rad", sign=0 if self.form else 1),)
+        return (dataclasses.replace(SLOPE, sign=0) if self.form else dataclasses.replace(SLOPE, beyond=""),)
 
     @property
     def equation(self) -> str:
@@ -111,7 +111,7 @@ class CoulombFriction(AbstractDryFriction):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("coulomb", "N·m", sign=0 if self.form else 1),)
+        return (dataclasses.replace(LEVEL, sign=0) if self.form else dataclasses.replace(LEVEL, beyond=""),)
 
     @property
     def equation(self) -> str:
