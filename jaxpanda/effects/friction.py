@@ -71,7 +71,8 @@ class ViscousFriction(AbstractInstantEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (dataclasses.replace(SLOPE, sign=0) if self.form else dataclasses.replace(SLOPE, beyond=""),)
+        sign, beyond = (0, SLOPE.beyond) if self.form else (1, "")
+        return (Coefficient(SLOPE.name, SLOPE.unit, sign, beyond),)
 
     @property
     def equation(self) -> str:
@@ -111,7 +112,8 @@ class CoulombFriction(AbstractDryFriction):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (dataclasses.replace(LEVEL, sign=0) if self.form else dataclasses.replace(LEVEL, beyond=""),)
+        sign, beyond = (0, LEVEL.beyond) if self.form else (1, "")
+        return (Coefficient(LEVEL.name, LEVEL.unit, sign, beyond),)
 
     @property
     def equation(self) -> str:

@@ -125,19 +125,19 @@ def _continuous(recording: Recording) -> None:
 
     A joint that comes there within what has passed since its position last changed has turned: rows were lost.
     """
+    if recording.samples < 2:
+        return
     every = float(np.median(np.diff(recording.time)))
     stays = max(1, round(_STAYS / every))
     for j, q in enumerate(recording.q.T):
         at = np.flatnonzero(np.diff(q)) + 1
-        step, elapsed = np.diff(q)[at - 1], np.diff(recording.time[np.r_[0, at]])
+        step, elapsed = q[at] - q[at - 1], np.diff(recording.time[np.r_[0, at]])
         speed = np.abs(step) / np.maximum(elapsed, every)
-        fast = np.flatnonzero((np.abs(step) > _RESETS) & (speed > _FASTEST))
-        for k in fast:
-            beside = speed[max(0, k - 2) : k + 3]
-            usual = np.sort(beside)[-2] if len(beside) > 1 else 0.0
-            i = int(at[k])
-            after = q[i : i + stays] - q[i - 1]
-            if speed[k] > _APART * usual and np.all(after / step[k] > 0.5):
+        wide = np.pad(speed, 2)
+        beside = np.max([wide[k : k + len(speed)] for k in (0, 1, 3, 4)], 0)
+        alone = (np.abs(step) > _RESETS) & (speed > _FASTEST) & (speed > _APART * beside)
+        for i, size in zip(at[alone], step[alone], strict=True):
+            if np.all((q[i : i + stays] - q[i - 1]) / size > 0.5):
                 raise InputError(
                     f"{recording.name}: column q_{j + 1} jumps from {q[i - 1]:.4g} rad to {q[i]:.4g} rad at "
                     f"{recording.time[i]:.6g} s and stays there, as where an encoder is reset while the log runs "
