@@ -5,10 +5,11 @@ Every joint is compared by itself. Samples of its low-passed torque are explaine
 $$ \tau = \mu + B\,x + F\,(s + C\,z) + e, \quad x, z \sim N(0, 1), \quad e \sim N(0, a^2 R_\rho), $$
 
 with $\mu$ the torque of the user's model under a reading of the column. B is what may well be wrong in a model
-that is read rightly: links, a payload, viscous friction, an offset, rotor inertia, a spring, a delay, a gain and
-a slight tilt, all with wide deviations. F is the size of dry friction: s the sign of velocity, C how far friction
-may be from that, with one number for each rest, in which it holds whatever load is left to it, up to about F. So
-a rest says no more than one sample does, and friction holds no load at rest that it would not brake in motion.
+that is read rightly: links, a payload, viscous friction, an offset, rotor inertia, a spring, a body that spins
+and so feels other joints' velocities, a delay, a gain and a slight tilt, all with wide deviations. F is the size
+of dry friction: s the sign of velocity, C how far friction may be from that, with one number for each rest, in
+which it holds whatever load is left to it, up to about F. So a rest says no more than one sample does, and
+friction holds no load at rest that it would not brake in motion.
 The error e is correlated over a time $\rho$. Its size a, $\rho$, F and the size of x are integrated out, so that
 unmodelled physics only makes e larger, whatever the reading. A column in another unit or of another joint is far
 from any of this, and its reading gains many nats.
@@ -80,7 +81,8 @@ _LOAD = 0.15, 0.1
 _GAIN, _TILT, _DELAY = 0.25, 0.1, 0.05
 """Deviations of a sensor's gain, as a share; of a base that is not level [rad]; of a delay [s]."""
 _FREE = 1.0
-"""Deviation of friction but dry, offset, rotor inertia and spring, in the size of the joint's torque."""
+"""Deviation of friction but dry, offset, rotor inertia, spring and a spinning body's torque, in the size of the
+joint's torque."""
 _FRICTIONS = np.geomspace(0.003, 0.8, 8)
 """Sizes of dry friction, in the size of the arm's largest joint torque: the drive's, whatever a joint bears."""
 _SLIDING, _HELD = 0.3, 0.7
@@ -413,6 +415,7 @@ class _Model:
             np.ones(len(qd)),
             unit(self.qdd[:, j]),
             unit(self.q[:, j] - self.q[:, j].mean()),
+            *(unit(other) for other in np.delete(self.qd, j, 1).T),
         ]
         slow = np.gradient(self.torque[:, j], self.samples.time)
         held = np.exp(-0.5 * (qd / _RESTS) ** 2)
