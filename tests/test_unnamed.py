@@ -1,16 +1,20 @@
 """What no effect explains: lines in the spectrum of the torque, found where they are and nowhere else."""
 
+import dataclasses
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import excitation, half_correlated
+from helpers import excitation, half_correlated, record
 from jaxpanda_kernels import rnea
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose
 from jaxpanda.diagnosis.premises import pose
+from jaxpanda.diagnosis.state import start
 from jaxpanda.diagnosis.traces import prepare as prepare_trace
-from jaxpanda.diagnosis.unnamed import hum, stuck
+from jaxpanda.diagnosis.unnamed import held_off, hum, stuck
 from jaxpanda.signals import prepare
 
 ARM = Arm.panda()
@@ -76,6 +80,22 @@ def test_what_depends_on_the_motion_is_no_hum():
     assert heard(recording(added=rubs)) is None
 
 
+@pytest.mark.parametrize(("off", "holds", "told"), [(8.0, 0.0, True), (8.0, 10.0, False), (0.5, 0.0, False)])
+def test_a_joint_that_holds_still_is_off_by_no_more_than_friction_carries(off, holds, told):
+    """A sensor at its limit on a joint that never moved, 55 times its noise off, had been called consistent."""
+    arm = dataclasses.replace(ARM, frictionloss=jnp.zeros(7).at[3].set(holds))
+    one = record(0, lambda t, q, qd, qdd: off * np.eye(7)[3] * np.ones_like(q), arm=arm, still=[3])
+    problem = pose((prepare_trace(one, arm),), (True,), "exact").problem
+    found = held_off(problem, start(problem))
+    if not told:
+        assert found is None
+        return
+    assert found is not None
+    assert (found.effect, found.joints) == ("unknown", (3,))
+    assert found.rms_torque[3] == pytest.approx(off, rel=0.05)
+    assert found.confidence > 0.9
+
+
 def test_what_a_healthy_arm_hummed_before_is_not_missing():
     hums, healthy = at_joints(0.1, 50.0, 1), recording(1, at_joints(0.1, 50.0, 1), "healthy.csv")
     assert heard(recording(0, hums), healthy, active=(True, False)) is None
@@ -101,8 +121,8 @@ def test_a_diagnosis_says_that_it_hums_beside_what_it_finds(tmp_path):
 def test_a_torque_that_repeats_itself_while_the_arm_moves_is_told_with_its_times():
     one = recording()
     frozen = [(3.0, 3.6), (9.0, 9.5)]
-    for start, stop in frozen:
-        inside = (one.time >= start) & (one.time <= stop)
+    for begin, stop in frozen:
+        inside = (one.time >= begin) & (one.time <= stop)
         one.tau[inside, 1] = one.tau[np.argmax(inside), 1]
     trace = prepare_trace(one, ARM)
     found = stuck(pose((trace,), (True,), "exact").problem, np.full(7, NOISE))
@@ -110,8 +130,8 @@ def test_a_torque_that_repeats_itself_while_the_arm_moves_is_told_with_its_times
     assert (found.effect, found.joints) == ("unknown", (1,))
     np.testing.assert_allclose(found.intervals, frozen, atol=2 / RATE)
     assert found.rms_torque[1] > 3 * NOISE
-    for start, stop in frozen:
-        inside = (trace.motion.time > start) & (trace.motion.time < stop)
+    for begin, stop in frozen:
+        inside = (trace.motion.time > begin) & (trace.motion.time < stop)
         assert not trace.trust[inside, 1].any()
         assert trace.trust[inside, 4].any()
 

@@ -18,7 +18,7 @@ from .problem import Problem, Term
 from .search import posterior
 from .state import State, coefficients, foretelling, leftover, torque, without
 from .uncertainty import covariances, leaned
-from .unnamed import hum, standing_off, stuck
+from .unnamed import held_off, hum, standing_off, stuck
 
 LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05
 """When a joint is not fully explained: this share of its squared residual beyond noise is left, more than this
@@ -74,7 +74,8 @@ def findings(
     halted = stuck(problem, state.noise.std)
     unnamed = hum([t.signals for t in problem.traces], problem.active, state.noise.std, **lowest)
     explained = lambda f: float(np.sum(np.square(f.rms_torque / state.noise.std)))
-    out = sorted(out, key=explained, reverse=True) + [f for f in (halted, unnamed) if f is not None]
+    still = held_off(problem, state)
+    out = sorted(out, key=explained, reverse=True) + [f for f in (halted, unnamed, still) if f is not None]
     return out + standing_off(problem, state, {j for f in out for j in f.joints})
 
 

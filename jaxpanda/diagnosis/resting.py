@@ -440,7 +440,7 @@ def _body(motions: Sequence[Motion], effect: str, odds: float, positive: bool) -
     return _Model(effect, columns * scales, odds, k, names, positive)
 
 
-def _carries(arm: Arm) -> Float[np.ndarray, " dof"]:
+def may_carry(arm: Arm) -> Float[np.ndarray, " dof"]:
     """Deviation of friction that a model lacks, by what hangs beyond a joint [N m]."""
     mass = np.asarray(arm.standard[:, 0])
     steps = np.linalg.norm(np.asarray(arm.chain.p), axis=1)
@@ -479,7 +479,7 @@ def _events(level: Level, arm: Arm) -> list[Finding]:
     quiet = ~level.event
     if not level.event.any() or not quiet.any():
         return out
-    dof, carries = arm.dof, _carries(arm)
+    dof, carries = arm.dof, may_carry(arm)
     bound, none = 2 * np.asarray(arm.frictionloss), np.zeros((dof, 0))
     for first, last in edges.reshape(-1, 2).tolist():
         d = level.mean[first:last].mean(0) - level.level
@@ -544,7 +544,7 @@ def _steady(
 ) -> list[Finding]:
     """What stands in the level of all recordings."""
     dof, loss = arm.dof, np.asarray(arm.frictionloss)
-    carries = _carries(arm)
+    carries = may_carry(arm)
     ds, stds, bounds = [], [], []
     for level in levels:
         d, std, bound = level.level, np.hypot(level.std, _ABSOLUTE * carries), loss

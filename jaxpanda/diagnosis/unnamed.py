@@ -2,6 +2,7 @@ r"""What no effect of the catalogue explains, and no free curve either.
 
 - A torque that is stuck: the sensor repeats its last value, or is at its limit, while the arm moves.
 - A joint that stands off its noise, always or now and then.
+- A joint that holds still throughout, off by more than friction may carry there.
 - A torque that hums: a line in its spectrum, as the mains, a fan or a shaking floor leave, at one frequency
   whatever the arm does. It is looked for in the torque as measured, also above the band in which effects are
   fitted, under Hann's window. A motion's harmonics come many together, and what depends on the motion is as wide
@@ -20,7 +21,8 @@ from ..signals import Signals, white_noise
 from .calibration import SUREST
 from .finding import Finding, joined
 from .problem import Problem
-from .state import State, mean_squares, misfit
+from .resting import may_carry
+from .state import State, coefficients, mean_squares, misfit
 from .traces import Trace
 
 BEYOND = 4.0
@@ -35,6 +37,8 @@ _LOWEST, _NEARBY = 5.0, 2.0
 """From where lines are looked for, and how far around them nothing else may be [Hz]."""
 _ALONE, _HEARD = 20.0, 0.5
 """By which factor a line's power exceeds any other there, and its rms over the noise's from which it counts."""
+_LACKS = 3.0
+"""Deviations of the friction that a model lacks which may be there."""
 _LOBE = 3
 """Bins on either side that a line takes under the window."""
 
@@ -114,6 +118,56 @@ def _standing_off(
         evidence=float(0.5 * samples * (beyond - 1 - np.log(beyond))),
         summary=f"Joint {joint + 1} is {np.sqrt(beyond):.1f} times its noise off the simulation{at}; neither a"
         " named effect nor a free curve explains it.",
+        terms=(),
+    )
+
+
+def held_off(problem: Problem, state: State) -> Finding | None:
+    """Joints that hold still throughout a recording while its torque is further from the simulation's than
+    friction at rest, and what the model's numbers are uncertain by, may carry; None where there are none.
+
+    Friction that the model lacks may be what an arm like this has, or as much as any that was found in it.
+    """
+    dry = [
+        np.concatenate(t.columns) @ coefficients(state, i) for i, t in enumerate(state.terms) if t.effect.dry
+    ]
+    found = max((float(np.sqrt(np.mean(torque**2, 0)).max()) for torque in dry), default=0.0)
+    x = state.design.x
+    seen: dict[int, tuple[float, Trace, np.ndarray]] = {}
+    for r, (trace, on) in enumerate(zip(problem.traces, problem.active, strict=True)):
+        if not on:
+            continue
+        arm, there = trace.motion.arm, trace.weight > 0
+        friction = trace.residual_at_rest - trace.residual
+        white = white_noise(trace.signals.tau) if trace.signals.tau is not None else np.zeros(arm.dof)
+        rubs = np.asarray(arm.frictionloss) + np.maximum(_LACKS * may_carry(arm), found)
+        for joint in np.flatnonzero(~trace.trust.any(0)).tolist():
+            unsure = np.sqrt(np.sum(problem.nuisance[r][:, joint] ** 2, 1))
+            off = (misfit(problem, state.terms, x, joint)[r] + friction[:, joint])[there]
+            may = (rubs[joint] + _COLOURED * white[joint] + _UNSURE * unsure)[there]
+            times = float(np.mean(off**2) / np.mean(may**2))
+            if times >= BEYOND and times > seen.get(joint, (0.0,))[0]:
+                seen[joint] = times, trace, off
+    if not seen:
+        return None
+    rms = np.zeros(problem.dof)
+    rms[list(seen)] = [np.sqrt(np.mean(off**2)) for _, _, off in seen.values()]
+    clearest = max(seen, key=lambda joint: seen[joint][0])
+    times, trace, off = seen[clearest]
+    return Finding(
+        effect="unknown",
+        joints=tuple(sorted(seen)),
+        recordings=tuple(dict.fromkeys(trace.name for _, trace, _ in seen.values())),
+        intervals=None,
+        confidence=1 - 1 / times,
+        alternatives=(),
+        equation="no law was found",
+        parameters=(),
+        rms_torque=rms,
+        evidence=float(0.5 * len(off) * (times - 1 - np.log(times))),
+        summary=f"Joint {clearest + 1} holds still throughout {trace.name}, and its torque is"
+        f" {rms[clearest]:.3g} {problem.arm.unit('N·m', clearest)} rms off the simulation's,"
+        f" {np.sqrt(times):.1f} times what friction at rest may carry.",
         terms=(),
     )
 
