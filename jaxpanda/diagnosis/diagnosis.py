@@ -34,7 +34,7 @@ from .next_motion import NextMotion, next_motion
 from .posterior import posterior_of
 from .premises import Premises, settled
 from .problem import FOLDS, Problem, Term
-from .search import transferable
+from .search import stand_ins, transferable
 from .state import State, with_terms
 from .traces import Trace, trajectory
 from .uncertainty import polished
@@ -193,6 +193,8 @@ def sought(
     contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
     wrong = numbers(problem, state, premises.changes) if contradicted else []
     kept = transferable(problem, laws)
+    doubtful = stand_ins(problem, kept)
+    kept = with_terms(problem, [t for t in kept.terms if all(t is not d for d in doubtful)])
     background = premises.background if kept.terms or wrong else ()
     lasting = [t for t, on in zip(premises.background, premises.lasting, strict=True) if background and on]
     correct = lambda by: _corrected(arm, premises, lasting, by, refitted=bool(by.terms or wrong))
@@ -204,7 +206,7 @@ def sought(
         lasting = [t for t in lasting if id(t) not in gone]
         kept = with_terms(problem, [t for t in kept.terms if id(t) not in gone])
         corrected = correct(kept)
-    lost = [all(t is not k for k in kept.terms) for t in laws.terms]
+    lost = [all(t is not k for k in (*kept.terms, *doubtful)) for t in laws.terms]
     fitted = fit(problem, kept)
     found = [*findings(problem, searched, state, laws, lost, fitted.missed), *wrong]
     more = partly(problem, state) or not all(_judged(problem))
@@ -229,6 +231,12 @@ def sought(
         notes.append(
             "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
             f" or with all of the motion: {', '.join(sorted(dropped))}"
+        )
+    if doubtful:
+        where = ", ".join(str(j) for j in sorted({j + 1 for t in doubtful for j in t.effect.joints}))
+        notes.append(
+            f"left out of the corrected model: the free curve at joint {where}, which leaves more than half of"
+            " what it is fitted to where it was not fitted"
         )
     corrected = as_recorded(moved, buildable(source, corrected, problem), _judged(problem))
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]

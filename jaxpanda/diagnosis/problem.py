@@ -403,9 +403,11 @@ class Problem:
                 error += float(np.sum((r[rows] - A[rows] @ x) ** 2))
         return error
 
-    def predicted_error(self, design: Design, noise: Noise, *, spread: bool = False) -> tuple[float, float]:
-        """Squared error of predicted torque, over the noise's deviation, where coefficients were not fitted: with
-        the model of the design, and with the user's.
+    def predicted_error(
+        self, design: Design, noise: Noise, *, spread: bool = False
+    ) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
+        """Squared error of each joint's predicted torque, over the noise's deviation, where coefficients were not
+        fitted: with the model of the design, with the user's, and of noise alone.
 
         In other recordings, or in other blocks of the only one.
         """
@@ -417,7 +419,8 @@ class Problem:
         tested = np.any([test for _, test in folds], 0)
         users = weight * np.concatenate(self.residual)
         left = self._mispredicted(design, folds) / noise.std
-        return float(np.sum(left**2)), float(np.sum(users[tested] ** 2))
+        alone = weight[tested] * noise.std
+        return np.sum(left**2, 0), np.sum(users[tested] ** 2, 0), np.sum(alone**2, 0)
 
     def mispredicted(
         self, design: Design, noises: Sequence[Noise], *, spread: bool = False

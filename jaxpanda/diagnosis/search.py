@@ -456,14 +456,14 @@ def transferable(problem: Problem, state: State) -> State:
     """
     state = with_terms(problem, [t for i, t in enumerate(state.terms) if not is_undetermined(state, i)])
     while lasting := [i for i, t in enumerate(state.terms) if not t.effect.bound_to_recording]:
-        whole, users = problem.predicted_error(state.design, state.noise)
+        whole, users = (float(sum(x)) for x in problem.predicted_error(state.design, state.noise)[:2])
         drifting = any(state.terms[i].effect.drifts for i in lasting)
-        all_over = problem.predicted_error(state.design, state.noise, spread=True)[0] if drifting else whole
+        spread = problem.predicted_error(state.design, state.noise, spread=True)[0] if drifting else ()
         harm = {}
         for i in lasting:
             drifts = state.terms[i].effect.drifts
-            less, _ = problem.predicted_error(without(state, i), state.noise, spread=drifts)
-            harm[i] = (all_over if drifts else whole) - less
+            less = problem.predicted_error(without(state, i), state.noise, spread=drifts)[0]
+            harm[i] = (float(sum(spread)) if drifts else whole) - float(sum(less))
         worst = max(harm, key=lambda i: harm[i])
         if harm[worst] > 0:
             state = with_terms(problem, (*state.terms[:worst], *state.terms[worst + 1 :]))
@@ -472,6 +472,20 @@ def transferable(problem: Problem, state: State) -> State:
         else:
             break
     return state
+
+
+def stand_ins(problem: Problem, state: State) -> list[Term]:
+    """The free forms that leave more than half of what they are fitted to, beyond noise, where they were not
+    fitted. A law would leave none: what they stand for is something else, and another motion is another one."""
+    out = []
+    for i, term in enumerate(state.terms):
+        if term.effect.free and not term.effect.bound_to_recording:
+            whole, _, alone = problem.predicted_error(state.design, state.noise)
+            less = problem.predicted_error(without(state, i), state.noise)[0]
+            at = term.acts
+            if np.sum((whole - alone)[at]) > 0.5 * np.sum((less - alone)[at]):
+                out.append(term)
+    return out
 
 
 def is_undetermined(state: State, i: int) -> bool:
