@@ -30,7 +30,14 @@ from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TimeDelay, TorqueDrift
 from jaxpanda.effects.stribeck import StribeckBristles
 from jaxpanda.effects.twist import Law, twist_torque
-from jaxpanda.effects.unknown import Unknown, UnknownAt, UnknownOfTwo
+from jaxpanda.effects.unknown import (
+    Unknown,
+    UnknownAt,
+    UnknownDrag,
+    UnknownOfSpeeds,
+    UnknownOfTwo,
+    UnknownSpin,
+)
 
 NAMES = {
     "viscous_friction", "coulomb_friction", "power_law_friction", "asymmetric_friction", "stribeck_friction",
@@ -76,6 +83,9 @@ def shapes(arm: Arm):
         ExternalContact(4, 1.0, 2.0, "a.csv", "point base", (0.0, 0.1, 0.05)),
         ExternalContact(4, 1.0, 2.0, "a.csv", "point link", (0.0, 0.1, 0.05)),
         UnknownOfTwo(2, 1, (-0.4, -0.4), (0.4, 0.4)),
+        UnknownOfSpeeds(2, 1, 3, 0.2),
+        UnknownDrag(arm.dof, 0.1, (0.1, 0.4)),
+        UnknownSpin(arm.dof),
         UnknownAt(2, 0.1, 0.2),
         *(Unknown(2, 2, (-0.4, 0.0, 0.4), form) for form in ("of q", "of q_k", "friction of q")),
     ]

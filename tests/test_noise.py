@@ -14,7 +14,7 @@ from jaxpanda import Arm, InputError, Recording
 from jaxpanda.diagnosis import diagnose
 from jaxpanda.diagnosis.diagnosis import _unheard
 from jaxpanda.diagnosis.evidence import Noise, levelled
-from jaxpanda.diagnosis.noise import borne_out
+from jaxpanda.diagnosis.noise import DETAILS, borne_out
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.state import _levelled_squares, beyond, slow_errors, start
 from jaxpanda.diagnosis.traces import prepare
@@ -60,8 +60,19 @@ def test_a_joint_with_few_samples_that_tell_gets_a_coarser_model_and_is_judged()
     trust[:, 4] = np.where(np.arange(len(trust)) < 90, 1.0, 1e-3)  # as where its motion is too sharp
     saturation = pose((dataclasses.replace(trace, trust=trust),), (True,), "exact").problem.saturation
     assert all(saturation.tells(j) for j in range(7))
-    assert saturation.columns(4).shape[1] < saturation.columns(4, detail=1.0).shape[1]
-    assert saturation.columns(3).shape == saturation.columns(3, detail=1.0).shape
+    assert saturation.columns(4).shape[1] < saturation.columns(4, detail=DETAILS[0]).shape[1]
+    assert saturation.columns(3).shape == saturation.columns(3, detail=DETAILS[0]).shape
+
+
+def test_what_other_joints_velocities_do_is_no_noise():
+    """A torque by the product of two joints' velocities had passed for noise of several times the size."""
+    seed, t = 0, np.arange(0, 12, 1 / RATE)
+    _, qd, _ = excitation(ARM, t, seed)
+    one = still_right(12.0, seed)
+    assert one.tau is not None
+    bodies = (3.0 * qd[:, 1] * qd[:, 3] + 1.0 * qd[:, 4])[:, None] * np.eye(7)[0]
+    problem = pose((prepare(dataclasses.replace(one, tau=one.tau + bodies), ARM),), (True,), "exact").problem
+    np.testing.assert_allclose(problem.noise(()).std, noise_of(12.0, seed).std, rtol=0.1)
 
 
 def test_too_short_a_recording_is_refused_with_what_would_do():

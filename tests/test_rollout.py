@@ -28,7 +28,14 @@ from jaxpanda.effects.load import Payload, PayloadChange
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import EncoderOffset, TorqueOffset
 from jaxpanda.effects.stribeck import StribeckFriction
-from jaxpanda.effects.unknown import Unknown, UnknownAt, UnknownOfTwo
+from jaxpanda.effects.unknown import (
+    Unknown,
+    UnknownAt,
+    UnknownDrag,
+    UnknownOfSpeeds,
+    UnknownOfTwo,
+    UnknownSpin,
+)
 from jaxpanda.recordings import Recording, save
 from jaxpanda.simulation import JointFriction, Sensors, fourier_trajectory, simulate
 
@@ -61,6 +68,9 @@ def every_kind(arm: Arm) -> Corrected:
         (LoadDependentFriction(1, 0.02, 1.1, "coulomb"), [0.03, 0.1]),
         (Unknown(0, 1, (-1.0, 0.0, 1.0), "of q_k"), [0.2, -0.1, 0.1]),
         (UnknownOfTwo(1, 0, (-1.0, -1.0), (1.0, 1.0)), [0.02 * k for k in range(10)]),
+        (UnknownOfSpeeds(0, 1, 0, 0.5), [0.2]),
+        (UnknownDrag(arm.dof, 0.1, (0.1, 0.5)), [0.2, 1.0]),
+        (UnknownSpin(arm.dof), [0.02, -0.01, 0.03]),
         (UnknownAt(0, 0.2, 0.1), [0.1, -0.2, 0.2]),
         (PayloadChange(1, 1.0, EVER, "a.csv", "gained"), body),
         (ExternalContact(1, 0.7, 1.2, "a.csv", "point base", (0.1, 0.0, 0.0)), [3.0, 0.0, 5.0]),

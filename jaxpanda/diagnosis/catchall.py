@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..effects.unknown import FORMS, Unknown, UnknownOfTwo
+from ..effects import AbstractJointEffect, Motion
+from ..effects.unknown import FORMS, Unknown, UnknownDrag, UnknownOfSpeeds, UnknownOfTwo, UnknownSpin
 from .host import parallel
 from .library import Candidates, columns_of
 from .traces import Trace
@@ -15,8 +16,13 @@ _KNOTS = {"odd in dq": 8, "even in dq": 8, "of q": 10, "friction of q": 9}
 _FEW = 6
 _MOVES = 0.02
 """Travel from which a joint's position may count beside another's [rad]."""
+_FASTEST, _SLOW = 0.995, 1e-3
+"""Share of the samples in which a product of velocities is smaller than its largest, which counts if it is more
+than that [rad²/s²]."""
+_OF_FASTEST, _REACHES = (0.15, 0.4, 0.7, 1.0), (0.0, 0.1, 0.2)
+"""Knots of a drag, in the largest speed of the last link, and where beyond its frame it may be [m]."""
 
-Free = Unknown | UnknownOfTwo
+Free = Unknown | UnknownOfTwo | UnknownOfSpeeds | UnknownDrag | UnknownSpin
 
 _KINDS = {
     "odd in dq": lambda m, j: np.abs(m.qd[:, j]),
@@ -46,15 +52,34 @@ def build(traces: Sequence[Trace]) -> list[Candidates]:
     for j, k in itertools.permutations(np.flatnonzero(high - low > _MOVES).tolist(), 2):
         ends = tuple((float(x[j]), float(x[k])) for x in (low, high))
         alike["of q, q_k", 0].append(UnknownOfTwo(j, k, *ends))
+    qd = np.concatenate([t.motion.qd for t in traces])
+    for i, k in itertools.combinations_with_replacement(range(dof), 2):
+        largest = float(np.quantile(np.abs(qd[:, i] * qd[:, k]), _FASTEST))
+        if largest > _SLOW:
+            alike["of dq_i * dq_k", 0] += [UnknownOfSpeeds(j, i, k, largest) for j in range(dof)]
+
+    speeds = np.concatenate([_speed_of_last_link(t.motion) for t in traces])
+    knots = np.quantile(speeds, _FASTEST) * np.array(_OF_FASTEST)
+    if knots[0] > _SLOW:
+        alike["spin", 0].append(UnknownSpin(dof))
+        alike["drag", 0] += [UnknownDrag(dof, reach, tuple(knots.tolist())) for reach in _REACHES]
 
     def evaluated(same: list[Free]) -> list[Candidates]:
         columns = [columns_of(same, trace) for trace in traces]
+        local = isinstance(same[0], AbstractJointEffect)
         return [
-            Candidates((effect,), effect.joints[0], tuple(c[:, i : i + 1] for c in columns))
+            Candidates(
+                (effect,), effect.joints[0] if local else None, tuple(c[..., i : i + 1, :] for c in columns)
+            )
             for i, effect in enumerate(same)
         ]
 
     return [one for group in parallel(evaluated, alike.values()) for one in group]
+
+
+def _speed_of_last_link(motion: Motion) -> np.ndarray:
+    """[m/s]"""
+    return np.linalg.norm(np.einsum("tja,tj->ta", motion.wrench_columns[:, -1, :, :3], motion.qd), axis=1)
 
 
 def _knots(form: str, x: np.ndarray) -> np.ndarray:

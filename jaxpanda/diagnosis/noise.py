@@ -2,8 +2,8 @@
 
 The noise must not be read off the residual of the nominal model: what is slow in a missing effect would pass for
 correlated noise, and hide it. A saturated fit (rigid body with free parameters, smooth functions of position,
-velocity, load and time, dry friction that turns over a distance) takes any effect away first, as well as it can,
-at the price of its degrees of freedom.
+velocity, load and time, velocities of the other joints and products of any two, dry friction that turns over a
+distance) takes any effect away first, as well as it can, at the price of its degrees of freedom.
 """
 
 import dataclasses
@@ -22,8 +22,9 @@ from .traces import Trace
 ORDER = 3
 LEAST_FREE, FEWEST_FREE = 0.25, 25.0
 """Share of a joint's samples that the saturated model must leave free for them to tell of noise, and how many."""
-DETAILS = (1.0, 0.6, 0.35, 0.2)
-"""Shares of the knots that its smooth functions have; the first that leaves so much free is taken."""
+DETAILS = ((1.0, True), (1.0, False), (0.6, False), (0.35, False), (0.2, False))
+"""Shares of the knots that its smooth functions have, and whether other joints' velocities are in it; the first
+that leaves so much free is taken."""
 QUIETEST = 1e-9
 """Noise is taken for at least this [N m]."""
 _RANK = 1e-6  # least singular value that counts, as a share of the largest
@@ -43,7 +44,8 @@ def hats(x: Float[np.ndarray, " _time"], count: int) -> Float[np.ndarray, "_time
 class _Basis:
     """Of the columns of a joint's saturated model."""
 
-    detail: float
+    detail: tuple[float, bool]
+    """Of `DETAILS`."""
     U: Float[np.ndarray, "rows n"]
     """Orthonormal."""
     largest: float
@@ -92,22 +94,25 @@ class Saturation:
         self._bases: dict[int, _Basis] = {}
 
     def columns(
-        self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]] = (), detail: float | None = None
+        self,
+        joint: int,
+        extra: Sequence[Float[np.ndarray, "_time _n"]] = (),
+        detail: tuple[float, bool] | None = None,
     ) -> Float[np.ndarray, "_rows _n"]:
         """All columns of a joint, `extra` ones of each recording last; in as much detail as samples allow."""
-        if detail is None:
-            detail = self._basis(joint).detail
+        share, coupled = self._basis(joint).detail if detail is None else detail
 
         def stacked(part) -> np.ndarray:
             return np.concatenate([np.asarray(part(trace)) for trace in self.traces])
 
         def knots(count: int) -> int:
-            return round(detail * count)
+            return round(share * count)
 
         traces = self.traces
         Q, s, _ = np.linalg.svd(stacked(lambda t: t.motion.regressor[:, joint]), full_matrices=False)
         rigid = Q[:, s > 1e-7 * s[0]]
-        q, qd = stacked(lambda t: t.motion.q[:, joint]), stacked(lambda t: t.motion.qd[:, joint])
+        q, speeds = stacked(lambda t: t.motion.q[:, joint]), stacked(lambda t: t.motion.qd)
+        qd = speeds[:, joint]
         load = stacked(lambda t: t.motion.load[:, joint])
         sign = stacked(lambda t: t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / 0.01)))
         rates = [np.gradient(t.motion.load[:, joint], t.motion.dt) for t in traces]
@@ -117,6 +122,9 @@ class Saturation:
         clock = scipy.linalg.block_diag(*[hats(t.motion.time, knots(10)) for t in traces])
         shaken = stacked(lambda t: t.shaken[:, joint])
         smooth = [rigid, shaken, hats(q, knots(10)), speed, hats(load, knots(5)), swings, clock]
+        if coupled:
+            smooth.append(np.delete(speeds, joint, 1))
+            smooth += [speeds[:, i, None] * speeds[:, i:] for i in range(speeds.shape[1])]
         rough = [sign[:, None] * x for x in (speed, hats(q, knots(4)), hats(load, knots(3)), clock[:, ::2])]
         turned = turning(traces, joint)
         known = [stacked(lambda t: t.down(t.sign[:, joint]))[:, None]] if self._rubs(joint) else []
@@ -206,7 +214,7 @@ class Saturation:
             self._bases[joint] = basis
         return self._bases[joint]
 
-    def _of(self, joint: int, detail: float) -> "_Basis":
+    def _of(self, joint: int, detail: tuple[float, bool]) -> "_Basis":
         U, s, _ = np.linalg.svd(self.columns(joint, detail=detail), full_matrices=False)
         U = U[:, s > _RANK * s[0]]
         return _Basis(detail, U, float(s[0]), self.moments(U), self._count(joint))

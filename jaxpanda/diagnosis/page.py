@@ -236,10 +236,7 @@ def _pictures(found: Diagnosis, one: Finding, names: Sequence[str]) -> list[Figu
     rows = [np.flatnonzero(t.weight * on > 0) for t, on in zip(problem.traces, problem.active, strict=True)]
     fits = [np.asarray(f)[k, joint] for f, k in zip(own, rows, strict=True)]
     lefts = [a[k, joint] + f for a, k, f in zip(after, rows, fits, strict=True)]
-    seen_against = {c.name: c.seen_against for c in problem.catalogue}
-    against = "time" if effect is None else seen_against.get(one.effect, "time")
-    if effect is not None and effect.name == "unknown":
-        against = _of(effect)
+    against = "time" if effect is None else effect.seen_against
     label, x, turned = _regime(found, effect, joint, against)
     signs = [s[k] for s, k in zip(turned, rows, strict=True)]
     xs = np.concatenate([v[k] for v, k in zip(x, rows, strict=True)])
@@ -309,22 +306,6 @@ def _terms(found: Diagnosis, one: Finding):
 
 def _short(name: str, most: int = 40) -> str:
     return name if len(name) <= most else name[: most - 1] + "…"
-
-
-def _of(effect: AbstractEffect) -> str:
-    """What a free form is a function of."""
-    form = getattr(effect, "form", "of q")
-    return {
-        "odd in dq": "velocity",
-        "even in dq": "velocity",
-        "of q": "position",
-        "of load": "load",
-        "friction of q": "position, turned by direction",
-        "friction of load": "|load|, turned by direction",
-        "of ddq": "acceleration",
-        "of q_k": "source position",
-        "odd in dq_k": "source velocity",
-    }.get(form, "time")
 
 
 def _regime(found: Diagnosis, effect: AbstractEffect | None, joint: int, against: str):

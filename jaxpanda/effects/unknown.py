@@ -1,4 +1,4 @@
-"""What no named effect explains: a free function of one channel, so that it is still located and fitted."""
+"""What no named effect explains: a free function of a channel or two, so that it is still located and fitted."""
 
 from collections.abc import Sequence
 from typing import ClassVar, Literal
@@ -6,10 +6,12 @@ from typing import ClassVar, Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxpanda_kernels import link_poses
 from jaxtyping import Array, Float
 
 from ..arms.arm import Arm
 from .effect import (
+    AbstractArmEffect,
     AbstractDryFriction,
     AbstractInstantEffect,
     Coefficient,
@@ -18,7 +20,7 @@ from .effect import (
     sign_over_velocity,
     smooth_sign,
 )
-from .motion import Channels, Joint
+from .motion import Channels, Joint, Motion, wrench_columns
 
 FREE = -21.0
 """Prior of a torque that has no law."""
@@ -36,6 +38,18 @@ FORMS = {
     "odd in dq_k": "an odd function of another joint's velocity",
 }
 """What the free function may depend on."""
+_AGAINST = {
+    "odd in dq": "velocity",
+    "even in dq": "velocity",
+    "of q": "position",
+    "of load": "load",
+    "friction of q": "position, turned by direction",
+    "friction of load": "|load|, turned by direction",
+    "of ddq": "acceleration",
+    "of q_k": "source position",
+    "odd in dq_k": "source velocity",
+}
+"""`seen_against` of each."""
 
 
 class Unknown(AbstractInstantEffect):
@@ -55,6 +69,10 @@ class Unknown(AbstractInstantEffect):
     source: Joint
     knots: Float[Array, " n"] | tuple[float, ...]
     form: str = eqx.field(static=True)
+
+    @property
+    def seen_against(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return _AGAINST[self.form]
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["Unknown"]:
@@ -144,6 +162,7 @@ class UnknownOfTwo(AbstractInstantEffect):
     """
 
     name: ClassVar[str] = "unknown"
+    seen_against: ClassVar[str] = "position"
     prior: ClassVar[float] = FREE
     free: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
@@ -180,6 +199,143 @@ class UnknownOfTwo(AbstractInstantEffect):
 _POWERS = tuple((m, n) for m in range(4) for n in range(4 - m))
 
 
+class UnknownOfSpeeds(AbstractInstantEffect):
+    r"""A torque in proportion to the product of two joints' velocities, $	au_j = c\,\dot q_i\,\dot q_k / p$.
+
+    p is the largest product that was recorded, beyond which the torque is constant. Centrifugal and Coriolis
+    torque of bodies that are elsewhere than in the model is like that, pose by pose.
+    """
+
+    name: ClassVar[str] = "unknown"
+    prior: ClassVar[float] = FREE
+    free: ClassVar[bool] = True
+    repeats: ClassVar[bool] = True
+    reveals: ClassVar[str] = "each of the two joints moved fast alone, and both together"
+
+    joint: Joint
+    first: Joint
+    second: Joint
+    largest: Float[Array, ""] | float
+    """[rad²/s²]."""
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["UnknownOfSpeeds"]:
+        return []
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("torque_at_largest", "N·m"),)
+
+    @property
+    def equation(self) -> str:
+        i, k = int(self.first) + 1, int(self.second) + 1
+        return (
+            f"tau = torque_at_largest * dq_{i} * dq_{k} / {float(self.largest):.3g}, the fraction 1 at most:"
+            " the product of two joints' velocities"
+        )
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        return jnp.clip(s.qd[self.first] * s.qd[self.second] / self.largest, -1.0, 1.0)[None]
+
+
+class UnknownDrag(AbstractArmEffect):
+    r"""A force on the last link against its velocity, $\tau = J_n(q)^\top f(|v|)\,v / |v|$.
+
+    v is the velocity of the point at `reach` along the link's z axis [m]; f is piecewise linear, none at rest,
+    with a coefficient for its value at each knot, constant beyond the last. A hose that is dragged along gives
+    such a force, a fluid, and a tool that rubs. The last joint, which turns about that axis, does not feel it.
+    """
+
+    name: ClassVar[str] = "unknown"
+    prior: ClassVar[float] = FREE
+    reveals: ClassVar[str] = "the same path at several speeds, and with nothing fastened to the flange"
+
+    dof: int = eqx.field(static=True)
+    reach: float = eqx.field(static=True)
+    knots: tuple[float, ...] = eqx.field(static=True)
+    """Of the speed [m/s], from the first above rest."""
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["UnknownDrag"]:
+        return []
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return tuple(range(max(self.dof - 1, 1)))
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"force_at_knot_{k + 1}", "N", sign=1) for k in range(len(self.knots)))
+
+    @property
+    def equation(self) -> str:
+        law = f"tau = J_{self.dof}(q)^T f(|v|) v / |v|, f piecewise linear"
+        return f"{law}: a force on the last link against its velocity"
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        W, R = motion.wrench_columns[:, -1], motion.link_axes[:, -1]
+        force = W[..., :3] + np.cross(W[..., 3:], self.reach * R[:, None, :, 2])
+        v = -np.einsum("tja,tj->ta", force, motion.qd)
+        speed = np.linalg.norm(v, axis=1)
+        against = -np.einsum("tja,ta->tj", force, v / np.maximum(speed, 1e-9)[:, None])
+        return against[..., None] * np.asarray(_from_rest(jnp.asarray(speed), self.knots))[:, None]
+
+    def resist(self, c, arm, z, s, dt):
+        q = jnp.asarray(s.q)
+        W, R = wrench_columns(arm, q)[-1], link_poses(arm.chain, q)[0][-1]
+        force = W[:, :3] + jnp.cross(W[:, 3:], self.reach * R[:, 2])
+        v = -force.T @ s.qd
+        speed = jnp.sqrt(v @ v + 1e-18)
+        return Resistance(-force @ v / speed * (_from_rest(speed, self.knots) @ c), jnp.zeros_like(s.q), z)
+
+
+class UnknownSpin(AbstractArmEffect):
+    r"""A body that spins on the last link, $\tau = J_n(q)^\top (\omega \times R\,h)$.
+
+    Its momentum h is constant along the link's axes: a spindle, a grinder, a fan. Both J and the link's angular
+    velocity $\omega$ are of the link's turning.
+    """
+
+    name: ClassVar[str] = "unknown"
+    prior: ClassVar[float] = FREE
+    reveals: ClassVar[str] = "the same motion with what turns on the last link switched off"
+
+    dof: int = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["UnknownSpin"]:
+        return []
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return tuple(range(self.dof))
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(Coefficient(f"momentum_{axis}", "kg·m²/s") for axis in "xyz")
+
+    @property
+    def equation(self) -> str:
+        return f"tau = J_{self.dof}(q)^T (omega x momentum): a body that spins on the last link"
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        W, R = motion.wrench_columns[:, -1, :, 3:], motion.link_axes[:, -1]
+        omega = -np.einsum("tja,tj->ta", W, motion.qd)
+        return -np.einsum("tja,tka->tjk", W, np.cross(omega[:, None], np.swapaxes(R, 1, 2)))
+
+    def resist(self, c, arm, z, s, dt):
+        q = jnp.asarray(s.q)
+        W, R = wrench_columns(arm, q)[-1, :, 3:], link_poses(arm.chain, q)[0][-1]
+        return Resistance(-W @ jnp.cross(-W.T @ s.qd, R @ c), jnp.zeros_like(s.q), z)
+
+
+def _from_rest(x: Float[Array, "*t"], knots: Sequence[float]) -> Float[Array, "*t n"]:
+    """Share of each knot in a piecewise linear function that is zero at zero."""
+    ends = jnp.asarray([0.0, *knots])
+    passed = jnp.clip((x[..., None] - ends[:-1]) / jnp.diff(ends), 0.0, 1.0)
+    return passed - jnp.concatenate([passed[..., 1:], jnp.zeros_like(passed[..., :1])], -1)
+
+
 class UnknownAt(AbstractDryFriction):
     r"""A torque at one place on a joint's way: a notch, a magnet, a worn tooth or a tight spot.
 
@@ -187,6 +343,7 @@ class UnknownAt(AbstractDryFriction):
     """
 
     name: ClassVar[str] = "unknown"
+    seen_against: ClassVar[str] = "position"
     prior: ClassVar[float] = FREE
     free: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
@@ -228,4 +385,4 @@ class UnknownAt(AbstractDryFriction):
         return x, jnp.exp(-0.5 * x * x)
 
 
-EFFECTS = (Unknown, UnknownOfTwo, UnknownAt)
+EFFECTS = (Unknown, UnknownOfTwo, UnknownOfSpeeds, UnknownDrag, UnknownSpin, UnknownAt)
