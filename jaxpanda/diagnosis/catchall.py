@@ -17,10 +17,10 @@ _FEW = 6
 _MOVES = 0.02
 """Travel from which a joint's position may count beside another's [rad]."""
 _FASTEST, _SLOW = 0.995, 1e-3
-"""Share of the samples in which a product of velocities is smaller than its largest, which counts if it is more
-than that [rad²/s²]."""
+"""Share of the samples that are slower than the fastest, and how slow that may be: of a product of two joints'
+velocities [rad²/s²], and of the last link [m/s]."""
 _OF_FASTEST, _REACHES = (0.15, 0.4, 0.7, 1.0), (0.0, 0.1, 0.2)
-"""Knots of a drag, in the largest speed of the last link, and where beyond its frame it may be [m]."""
+"""Knots of a drag, in the speed of the last link at its fastest, and where beyond its frame it may act [m]."""
 
 Free = Unknown | UnknownOfTwo | UnknownOfSpeeds | UnknownDrag | UnknownSpin
 
@@ -60,7 +60,8 @@ def build(traces: Sequence[Trace]) -> list[Candidates]:
 
     speeds = np.concatenate([_speed_of_last_link(t.motion) for t in traces])
     knots = np.quantile(speeds, _FASTEST) * np.array(_OF_FASTEST)
-    if knots[0] > _SLOW:
+    of_drives = any(t.motion.transmitted is not None for t in traces)  # which feel links by their load alone
+    if knots[0] > _SLOW and not of_drives:
         alike["spin", 0].append(UnknownSpin(dof))
         alike["drag", 0] += [UnknownDrag(dof, reach, tuple(knots.tolist())) for reach in _REACHES]
 

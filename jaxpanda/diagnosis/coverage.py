@@ -114,7 +114,7 @@ def _gains(
     out = np.full((len(names), problem.dof), np.nan)
     for p, gain in zip(chosen, gains, strict=True):
         row, joints = names.index(p.effect.name), p.effect.joints
-        if len(joints) == problem.dof > 1:  # in the whole arm: each joint's share
+        if len(joints) > 1:  # each joint's share
             out[row] = np.fmax(out[row], gain)
         elif joints:
             out[row, joints[0]] = np.fmax(out[row, joints[0]], gain.sum())

@@ -477,15 +477,13 @@ def transferable(problem: Problem, state: State) -> State:
 def stand_ins(problem: Problem, state: State) -> list[Term]:
     """The free forms that leave more than half of what they are fitted to, beyond noise, where they were not
     fitted. A law would leave none: what they stand for is something else, and another motion is another one."""
-    out = []
-    for i, term in enumerate(state.terms):
-        if term.effect.free and not term.effect.bound_to_recording:
-            whole, _, alone = problem.predicted_error(state.design, state.noise)
-            less = problem.predicted_error(without(state, i), state.noise)[0]
-            at = term.acts
-            if np.sum((whole - alone)[at]) > 0.5 * np.sum((less - alone)[at]):
-                out.append(term)
-    return out
+    curves = [i for i, term in enumerate(state.terms) if term.effect.free]
+    if not curves:
+        return []
+    whole, _, alone = problem.predicted_error(state.design, state.noise)
+    beyond = lambda error, i: float(np.sum((error - alone)[state.terms[i].acts]))
+    less = {i: problem.predicted_error(without(state, i), state.noise)[0] for i in curves}
+    return [state.terms[i] for i in curves if beyond(whole, i) > 0.5 * beyond(less[i], i)]
 
 
 def is_undetermined(state: State, i: int) -> bool:

@@ -1,7 +1,7 @@
 """What no named effect explains: a free function of a channel or two, so that it is still located and fitted."""
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -200,7 +200,7 @@ _POWERS = tuple((m, n) for m in range(4) for n in range(4 - m))
 
 
 class UnknownOfSpeeds(AbstractInstantEffect):
-    r"""A torque in proportion to the product of two joints' velocities, $	au_j = c\,\dot q_i\,\dot q_k / p$.
+    r"""A torque in proportion to the product of two joints' velocities, $\tau_j = c\,\dot q_i\,\dot q_k / p$.
 
     p is the largest product that was recorded, beyond which the torque is constant. Centrifugal and Coriolis
     torque of bodies that are elsewhere than in the model is like that, pose by pose.
@@ -278,7 +278,7 @@ class UnknownDrag(AbstractArmEffect):
         v = -np.einsum("tja,tj->ta", force, motion.qd)
         speed = np.linalg.norm(v, axis=1)
         against = -np.einsum("tja,ta->tj", force, v / np.maximum(speed, 1e-9)[:, None])
-        return against[..., None] * np.asarray(_from_rest(jnp.asarray(speed), self.knots))[:, None]
+        return against[..., None] * np.stack(_from_rest(np.interp, speed, self.knots), 1)[:, None]
 
     def resist(self, c, arm, z, s, dt):
         q = jnp.asarray(s.q)
@@ -286,14 +286,18 @@ class UnknownDrag(AbstractArmEffect):
         force = W[:, :3] + jnp.cross(W[:, 3:], self.reach * R[:, 2])
         v = -force.T @ s.qd
         speed = jnp.sqrt(v @ v + 1e-18)
-        return Resistance(-force @ v / speed * (_from_rest(speed, self.knots) @ c), jnp.zeros_like(s.q), z)
+        return Resistance(
+            -force @ v / speed * (jnp.stack(_from_rest(jnp.interp, speed, self.knots)) @ c),
+            jnp.zeros_like(s.q),
+            z,
+        )
 
 
 class UnknownSpin(AbstractArmEffect):
     r"""A body that spins on the last link, $\tau = J_n(q)^\top (\omega \times R\,h)$.
 
-    Its momentum h is constant along the link's axes: a spindle, a grinder, a fan. Both J and the link's angular
-    velocity $\omega$ are of the link's turning.
+    Its angular momentum h is constant along the link's axes, R: a spindle, a grinder, a fan. J and $\omega$ are
+    the Jacobian and the velocity of the link's rotation.
     """
 
     name: ClassVar[str] = "unknown"
@@ -329,11 +333,10 @@ class UnknownSpin(AbstractArmEffect):
         return Resistance(-W @ jnp.cross(-W.T @ s.qd, R @ c), jnp.zeros_like(s.q), z)
 
 
-def _from_rest(x: Float[Array, "*t"], knots: Sequence[float]) -> Float[Array, "*t n"]:
-    """Share of each knot in a piecewise linear function that is zero at zero."""
-    ends = jnp.asarray([0.0, *knots])
-    passed = jnp.clip((x[..., None] - ends[:-1]) / jnp.diff(ends), 0.0, 1.0)
-    return passed - jnp.concatenate([passed[..., 1:], jnp.zeros_like(passed[..., :1])], -1)
+def _from_rest(interp: Any, x: Any, knots: Sequence[float]) -> list[Any]:
+    """Share of each knot in a piecewise linear function of x that is zero at zero; `interp`: numpy's or JAX's."""
+    ends = np.array([0.0, *knots])
+    return [interp(x, ends, share) for share in np.eye(len(ends))[1:]]
 
 
 class UnknownAt(AbstractDryFriction):
