@@ -84,7 +84,8 @@ def test_what_depends_on_the_motion_is_no_hum():
 def test_a_joint_that_holds_still_is_off_by_no_more_than_friction_carries(off, holds, told):
     """A sensor at its limit on a joint that never moved, 55 times its noise off, had been called consistent."""
     arm = dataclasses.replace(ARM, frictionloss=jnp.zeros(7).at[3].set(holds))
-    one = record(0, lambda t, q, qd, qdd: off * np.eye(7)[3] * np.ones_like(q), arm=arm, still=[3])
+    limit = lambda t, q, qd, qdd: off * np.eye(7)[3] * np.ones_like(q)
+    one = record(0, limit, arm=arm, still=[3])
     problem = pose((prepare_trace(one, arm),), (True,), "exact").problem
     found = held_off(problem, start(problem))
     if not told:

@@ -2,8 +2,9 @@
 
 The noise must not be read off the residual of the nominal model: what is slow in a missing effect would pass for
 correlated noise, and hide it. A saturated fit (rigid body with free parameters, smooth functions of position,
-velocity, load and time, velocities of the other joints and products of any two, dry friction that turns over a
-distance) takes any effect away first, as well as it can, at the price of its degrees of freedom.
+velocity, load and time, dry friction that turns over a distance, and where that shows velocities of the other
+joints and products of any two) takes any effect away first, as well as it can, at the price of its degrees of
+freedom.
 """
 
 import dataclasses
@@ -22,9 +23,8 @@ from .traces import Trace
 ORDER = 3
 LEAST_FREE, FEWEST_FREE = 0.25, 25.0
 """Share of a joint's samples that the saturated model must leave free for them to tell of noise, and how many."""
-DETAILS = ((1.0, True), (1.0, False), (0.6, False), (0.35, False), (0.2, False))
-"""Shares of the knots that its smooth functions have, and whether other joints' velocities are in it; the first
-that leaves so much free is taken."""
+DETAILS = (1.0, 0.6, 0.35, 0.2)
+"""Shares of the knots that its smooth functions have; the first that leaves so much free is taken."""
 QUIETEST = 1e-9
 """Noise is taken for at least this [N m]."""
 _RANK = 1e-6  # least singular value that counts, as a share of the largest
@@ -44,8 +44,9 @@ def hats(x: Float[np.ndarray, " _time"], count: int) -> Float[np.ndarray, "_time
 class _Basis:
     """Of the columns of a joint's saturated model."""
 
-    detail: tuple[float, bool]
-    """Of `DETAILS`."""
+    detail: float
+    coupled: bool
+    """Whether other joints' velocities are in it."""
     U: Float[np.ndarray, "rows n"]
     """Orthonormal."""
     largest: float
@@ -97,16 +98,19 @@ class Saturation:
         self,
         joint: int,
         extra: Sequence[Float[np.ndarray, "_time _n"]] = (),
-        detail: tuple[float, bool] | None = None,
+        detail: float | None = None,
+        coupled: bool = False,
     ) -> Float[np.ndarray, "_rows _n"]:
         """All columns of a joint, `extra` ones of each recording last; in as much detail as samples allow."""
-        share, coupled = self._basis(joint).detail if detail is None else detail
+        if detail is None:
+            basis = self._basis(joint)
+            detail, coupled = basis.detail, basis.coupled
 
         def stacked(part) -> np.ndarray:
             return np.concatenate([np.asarray(part(trace)) for trace in self.traces])
 
         def knots(count: int) -> int:
-            return round(share * count)
+            return round(detail * count)
 
         traces = self.traces
         Q, s, _ = np.linalg.svd(stacked(lambda t: t.motion.regressor[:, joint]), full_matrices=False)
@@ -144,7 +148,7 @@ class Saturation:
         """What the model with `extra` columns leaves of the measured torque, and the bases of what it takes."""
         basis = self._basis(joint)
         U, largest = basis.U, basis.largest
-        r = np.concatenate([t.residual[:, joint] for t in self.traces]) * self._weight(joint)
+        r = self._residual(joint)
         r = r - U @ (U.T @ r)
         if not len(extra):
             return r, [U]
@@ -211,13 +215,25 @@ class Saturation:
                 if basis.tells:
                     break
                 basis = self._of(joint, coarser)
-            self._bases[joint] = basis
+            wider = self._of(joint, basis.detail, coupled=True)
+            self._bases[joint] = wider if wider.tells and self._bears_out(joint, basis, wider) else basis
         return self._bases[joint]
 
-    def _of(self, joint: int, detail: tuple[float, bool]) -> "_Basis":
-        U, s, _ = np.linalg.svd(self.columns(joint, detail=detail), full_matrices=False)
+    def _of(self, joint: int, detail: float, coupled: bool = False) -> "_Basis":
+        U, s, _ = np.linalg.svd(self.columns(joint, detail=detail, coupled=coupled), full_matrices=False)
         U = U[:, s > _RANK * s[0]]
-        return _Basis(detail, U, float(s[0]), self.moments(U), self._count(joint))
+        return _Basis(detail, coupled, U, float(s[0]), self.moments(U), self._count(joint))
+
+    def _bears_out(self, joint: int, less: _Basis, more: _Basis) -> bool:
+        """Whether a joint's torque is likelier by more than what the further columns are worth (Schwarz 1978)."""
+        r = self._residual(joint)
+        left = [max(float(r @ r - np.sum((basis.U.T @ r) ** 2)), 1e-300) for basis in (less, more)]
+        count, numbers = less.count, more.U.shape[1] - less.U.shape[1]
+        return count * np.log(left[0] / left[1]) > numbers * np.log(count)
+
+    def _residual(self, joint: int) -> Float[np.ndarray, " _rows"]:
+        """Measured less modelled torque, by what each row weighs."""
+        return np.concatenate([t.residual[:, joint] for t in self.traces]) * self._weight(joint)
 
     def moments(self, x: Float[np.ndarray, "_rows _n"]) -> Float[np.ndarray, "_lags _lags"]:
         """`moments` of the recordings, one below the other."""
