@@ -2,9 +2,9 @@
 
 The noise must not be read off the residual of the nominal model: what is slow in a missing effect would pass for
 correlated noise, and hide it. A saturated fit (rigid body with free parameters, smooth functions of position,
-velocity, load and time, dry friction that turns over a distance, and where that shows velocities of the other
-joints and products of any two) takes any effect away first, as well as it can, at the price of its degrees of
-freedom.
+velocity, load and time, dry friction that turns over a distance, and where that takes most of the rest velocities
+of the other joints and products of any two) takes any effect away first, as well as it can, at the price of its
+degrees of freedom.
 """
 
 import dataclasses
@@ -225,11 +225,12 @@ class Saturation:
         return _Basis(detail, coupled, U, float(s[0]), self.moments(U), self._count(joint))
 
     def _bears_out(self, joint: int, less: _Basis, more: _Basis) -> bool:
-        """Whether a joint's torque is likelier by more than what the further columns are worth (Schwarz 1978)."""
+        """Whether the further columns take more than half of what the others leave of a joint's torque, and make
+        it likelier by more than so many numbers are worth (Schwarz 1978)."""
         r = self._residual(joint)
         left = [max(float(r @ r - np.sum((basis.U.T @ r) ** 2)), 1e-300) for basis in (less, more)]
         count, numbers = less.count, more.U.shape[1] - less.U.shape[1]
-        return count * np.log(left[0] / left[1]) > numbers * np.log(count)
+        return left[0] > max(2.0, count ** (numbers / count)) * left[1]
 
     def _residual(self, joint: int) -> Float[np.ndarray, " _rows"]:
         """Measured less modelled torque, by what each row weighs."""
