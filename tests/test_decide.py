@@ -7,9 +7,10 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
-from helpers import record
+from helpers import record, to_mujoco
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose, predict
@@ -481,6 +482,40 @@ def test_a_torque_of_two_joints_velocities_is_found_as_such():
     assert (finding.effect, finding.joints) == ("unknown", (0,))
     assert "dq_2 * dq_4" in finding.equation
     assert found.fit.held_out_rmse_after[0] < 1.2 * found.fit.noise_floor[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("law", "said"),
+    [
+        (lambda J, W, R, qd: J.T @ (20.0 * np.linalg.norm(J @ qd) * (J @ qd)), "against its velocity"),
+        (lambda J, W, R, qd: W.T @ np.cross(W @ qd, R @ [0.5, -0.2, 1.0]), "spins"),
+    ],
+    ids=["drag", "spin"],
+)
+def test_what_acts_on_the_last_link_alone_is_told_as_one_cause_in_all_joints(law, said):
+    """By the Jacobians J and W of MuJoCo; it had been told as contacts, drifts and friction, after minutes."""
+    arm = Arm.panda()
+    model = to_mujoco(arm.chain, arm.standard)
+    data, last = mujoco.MjData(model), model.nbody - 1
+    J, W = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+
+    def extra(t, q, qd, qdd):
+        tau = np.zeros_like(q)
+        for k in range(len(t)):
+            data.qpos[:] = q[k]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_jac(model, data, J, W, data.xpos[last], last)
+            tau[k] = law(J, W, data.xmat[last].reshape(3, 3), qd[k])
+        return tau
+
+    found = diagnose(None, [record(33, extra), record(34, extra)], knowledge="exact")
+    (finding,) = found.findings
+    assert finding.effect == "unknown"
+    assert set(range(6)) <= set(finding.joints)
+    assert said in finding.equation
+    assert np.all(found.fit.held_out_rmse_after < 1.2 * found.fit.noise_floor)
 
 
 @pytest.mark.slow

@@ -5,10 +5,12 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.interpolate
+from helpers import to_mujoco
 from jaxpanda_kernels import rnea
 
 from jaxpanda import Arm
@@ -211,6 +213,23 @@ def test_a_force_at_a_point_is_the_wrench_of_its_moment(arm, motion):
     moment = np.cross(motion.link_axes[123, 4] @ np.array(point), F)
     wrench = ExternalContact(4, -1.0, 9.0, "a.csv", "base").over(motion)[123] @ np.concatenate([F, moment])
     np.testing.assert_allclose(tau, wrench, atol=1e-10)
+
+
+def test_a_drag_and_a_spin_are_what_mujoco_s_jacobians_make_of_them(arm, motion):
+    model, reach, slope = to_mujoco(arm.chain, arm.standard), 0.15, 3.0
+    momentum = np.array([0.02, -0.05, 0.03])
+    data, last = mujoco.MjData(model), model.nbody - 1
+    drag = UnknownDrag(arm.dof, reach, (0.5, 10.0)).over(motion) @ (slope * np.array([0.5, 10.0]))
+    spin = UnknownSpin(arm.dof).over(motion) @ momentum
+    linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+    for k in range(0, motion.samples, max(1, motion.samples // 20)):
+        data.qpos[:], data.qvel[:] = motion.q[k], motion.qd[k]
+        mujoco.mj_forward(model, data)
+        R = data.xmat[last].reshape(3, 3)
+        mujoco.mj_jac(model, data, linear, angular, data.xpos[last] + reach * R[:, 2], last)
+        np.testing.assert_allclose(drag[k], slope * linear.T @ linear @ motion.qd[k], atol=1e-9)
+        turns = np.cross(angular @ motion.qd[k], R @ momentum)
+        np.testing.assert_allclose(spin[k], angular.T @ turns, atol=1e-9)
 
 
 def test_a_contact_acts_in_its_interval_only(motion):

@@ -16,11 +16,10 @@ _KNOTS = {"odd in dq": 8, "even in dq": 8, "of q": 10, "friction of q": 9}
 _FEW = 6
 _MOVES = 0.02
 """Travel from which a joint's position may count beside another's [rad]."""
-_FASTEST, _SLOW = 0.995, 1e-3
-"""Share of the samples that are slower than the fastest, and how slow that may be: of a product of two joints'
-velocities [rad²/s²], and of the last link [m/s]."""
+_SLOW = 1e-3
+"""What a product of two joints' velocities [rad²/s²], and the last link's [m/s], must exceed to tell anything."""
 _OF_FASTEST, _REACHES = (0.15, 0.4, 0.7, 1.0), (0.0, 0.1, 0.2)
-"""Knots of a drag, in the speed of the last link at its fastest, and where beyond its frame it may act [m]."""
+"""Knots of a drag, in the largest speed of the last link, and where beyond its frame it may act [m]."""
 
 Free = Unknown | UnknownOfTwo | UnknownOfSpeeds | UnknownDrag | UnknownSpin
 
@@ -54,12 +53,12 @@ def build(traces: Sequence[Trace]) -> list[Candidates]:
         alike["of q, q_k", 0].append(UnknownOfTwo(j, k, *ends))
     qd = np.concatenate([t.motion.qd for t in traces])
     for i, k in itertools.combinations_with_replacement(range(dof), 2):
-        largest = float(np.quantile(np.abs(qd[:, i] * qd[:, k]), _FASTEST))
+        largest = float(np.max(np.abs(qd[:, i] * qd[:, k])))
         if largest > _SLOW:
             alike["of dq_i * dq_k", 0] += [UnknownOfSpeeds(j, i, k, largest) for j in range(dof)]
 
     speeds = np.concatenate([_speed_of_last_link(t.motion) for t in traces])
-    knots = np.quantile(speeds, _FASTEST) * np.array(_OF_FASTEST)
+    knots = np.max(speeds) * np.array(_OF_FASTEST)
     of_drives = any(t.motion.transmitted is not None for t in traces)  # which feel links by their load alone
     if knots[0] > _SLOW and not of_drives:
         alike["spin", 0].append(UnknownSpin(dof))

@@ -292,6 +292,13 @@ class UnknownDrag(AbstractArmEffect):
             z,
         )
 
+    def parameters(self, c, covariance):
+        knots = [
+            {"name": f"knot_{k + 1}", "joint": None, "value": x, "std": 0.0, "unit": "m/s"}
+            for k, x in enumerate(self.knots)
+        ]
+        return [{**p, "joint": None} for p in super().parameters(c, covariance)] + knots
+
 
 class UnknownSpin(AbstractArmEffect):
     r"""A body that spins on the last link, $\tau = J_n(q)^\top (\omega \times R\,h)$.
@@ -331,6 +338,9 @@ class UnknownSpin(AbstractArmEffect):
         q = jnp.asarray(s.q)
         W, R = wrench_columns(arm, q)[-1, :, 3:], link_poses(arm.chain, q)[0][-1]
         return Resistance(-W @ jnp.cross(-W.T @ s.qd, R @ c), jnp.zeros_like(s.q), z)
+
+    def parameters(self, c, covariance):
+        return [{**p, "joint": None} for p in super().parameters(c, covariance)]
 
 
 def _from_rest(interp: Any, x: Any, knots: Sequence[float]) -> list[Any]:
