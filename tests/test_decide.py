@@ -515,6 +515,7 @@ def test_what_acts_on_the_last_link_alone_is_told_as_one_cause_in_all_joints(law
     assert finding.effect == "unknown"
     assert set(range(6)) <= set(finding.joints)
     assert said in finding.equation
+    assert finding.summary.startswith("Joints 1, 2, 3, 4, 5, 6")
     assert np.all(found.fit.held_out_rmse_after < 1.2 * found.fit.noise_floor)
 
 

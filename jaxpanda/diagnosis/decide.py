@@ -292,6 +292,11 @@ def _summary(name, joints, rms, intervals, recordings, alternatives, problem, ow
     """One or two plain sentences."""
     strongest = int(np.argmax(rms))
     size = f"{rms[strongest]:.3g} {problem.arm.unit('N·m', strongest)} rms"
+    if name == "unknown" and len(joints) > 1:
+        return (
+            f"Joints {_listed(joints)} show up to {size}, at joint {strongest + 1}, that no named effect"
+            f" explains: {equation.split(': ')[-1]}."
+        )
     if name == "unknown":
         return (
             f"Joint {strongest + 1} shows {size} that no named effect explains; it is"
