@@ -193,8 +193,8 @@ def sought(
     contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
     wrong = numbers(problem, state, premises.changes) if contradicted else []
     kept = transferable(problem, laws)
-    doubtful = stand_ins(problem, kept)
-    kept = with_terms(problem, [t for t in kept.terms if all(t is not d for d in doubtful)])
+    if doubtful := stand_ins(problem, kept):
+        kept = with_terms(problem, [t for t in kept.terms if all(t is not d for d in doubtful)])
     background = premises.background if kept.terms or wrong else ()
     lasting = [t for t, on in zip(premises.background, premises.lasting, strict=True) if background and on]
     correct = lambda by: _corrected(arm, premises, lasting, by, refitted=bool(by.terms or wrong))

@@ -45,8 +45,6 @@ class _Basis:
     """Of the columns of a joint's saturated model."""
 
     detail: float
-    coupled: bool
-    """Whether other joints' velocities are in it."""
     U: Float[np.ndarray, "rows n"]
     """Orthonormal."""
     largest: float
@@ -95,16 +93,12 @@ class Saturation:
         self._bases: dict[int, _Basis] = {}
 
     def columns(
-        self,
-        joint: int,
-        extra: Sequence[Float[np.ndarray, "_time _n"]] = (),
-        detail: float | None = None,
-        coupled: bool = False,
+        self, joint: int, extra: Sequence[Float[np.ndarray, "_time _n"]] = (), detail: float | None = None
     ) -> Float[np.ndarray, "_rows _n"]:
-        """All columns of a joint, `extra` ones of each recording last; in as much detail as samples allow."""
+        """All columns of a joint but other joints' velocities, `extra` ones of each recording last; in as much
+        detail as samples allow."""
         if detail is None:
-            basis = self._basis(joint)
-            detail, coupled = basis.detail, basis.coupled
+            detail = self._basis(joint).detail
 
         def stacked(part) -> np.ndarray:
             return np.concatenate([np.asarray(part(trace)) for trace in self.traces])
@@ -115,8 +109,7 @@ class Saturation:
         traces = self.traces
         Q, s, _ = np.linalg.svd(stacked(lambda t: t.motion.regressor[:, joint]), full_matrices=False)
         rigid = Q[:, s > 1e-7 * s[0]]
-        q, speeds = stacked(lambda t: t.motion.q[:, joint]), stacked(lambda t: t.motion.qd)
-        qd = speeds[:, joint]
+        q, qd = stacked(lambda t: t.motion.q[:, joint]), stacked(lambda t: t.motion.qd[:, joint])
         load = stacked(lambda t: t.motion.load[:, joint])
         sign = stacked(lambda t: t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / 0.01)))
         rates = [np.gradient(t.motion.load[:, joint], t.motion.dt) for t in traces]
@@ -126,9 +119,6 @@ class Saturation:
         clock = scipy.linalg.block_diag(*[hats(t.motion.time, knots(10)) for t in traces])
         shaken = stacked(lambda t: t.shaken[:, joint])
         smooth = [rigid, shaken, hats(q, knots(10)), speed, hats(load, knots(5)), swings, clock]
-        if coupled:
-            smooth.append(np.delete(speeds, joint, 1))
-            smooth += [speeds[:, i, None] * speeds[:, i:] for i in range(speeds.shape[1])]
         rough = [sign[:, None] * x for x in (speed, hats(q, knots(4)), hats(load, knots(3)), clock[:, ::2])]
         turned = turning(traces, joint)
         known = [stacked(lambda t: t.down(t.sign[:, joint]))[:, None]] if self._rubs(joint) else []
@@ -147,17 +137,12 @@ class Saturation:
     ) -> tuple[Float[np.ndarray, " _rows"], list[Float[np.ndarray, "_rows _n"]]]:
         """What the model with `extra` columns leaves of the measured torque, and the bases of what it takes."""
         basis = self._basis(joint)
-        U, largest = basis.U, basis.largest
+        U = basis.U
         r = self._residual(joint)
         r = r - U @ (U.T @ r)
         if not len(extra):
             return r, [U]
-        E = np.concatenate(list(extra)) * self._weight(joint)[:, None]
-        largest = max(largest, float(np.linalg.norm(E, 2)))
-        for _ in range(2):  # once would leave rounding of what is taken off
-            E = E - U @ (U.T @ E)
-        V, s, _ = np.linalg.svd(E, full_matrices=False)
-        V = V[:, s > _RANK * largest]
+        V, _ = _beside(basis, np.concatenate(list(extra)) * self._weight(joint)[:, None])
         return r - V @ (V.T @ r), [U, V]
 
     def noise(
@@ -215,22 +200,29 @@ class Saturation:
                 if basis.tells:
                     break
                 basis = self._of(joint, coarser)
-            wider = self._of(joint, basis.detail, coupled=True)
-            self._bases[joint] = wider if wider.tells and self._bears_out(joint, basis, wider) else basis
+            self._bases[joint] = self._coupled(joint, basis)
         return self._bases[joint]
 
-    def _of(self, joint: int, detail: float, coupled: bool = False) -> "_Basis":
-        U, s, _ = np.linalg.svd(self.columns(joint, detail=detail, coupled=coupled), full_matrices=False)
+    def _of(self, joint: int, detail: float) -> _Basis:
+        U, s, _ = np.linalg.svd(self.columns(joint, detail=detail), full_matrices=False)
         U = U[:, s > _RANK * s[0]]
-        return _Basis(detail, coupled, U, float(s[0]), self.moments(U), self._count(joint))
+        return _Basis(detail, U, float(s[0]), self.moments(U), self._count(joint))
 
-    def _bears_out(self, joint: int, less: _Basis, more: _Basis) -> bool:
-        """Whether the further columns take more than half of what the others leave of a joint's torque, and make
-        it likelier by more than so many numbers are worth (Schwarz 1978)."""
-        r = self._residual(joint)
-        left = [max(float(r @ r - np.sum((basis.U.T @ r) ** 2)), 1e-300) for basis in (less, more)]
-        count, numbers = less.count, more.U.shape[1] - less.U.shape[1]
-        return left[0] > max(2.0, count ** (numbers / count)) * left[1]
+    def _coupled(self, joint: int, basis: _Basis) -> _Basis:
+        """With other joints' velocities and products of any two, where these take more than half of what the
+        others leave of a joint's torque, and make it likelier by more than they are worth (Schwarz 1978)."""
+        qd = np.concatenate([t.motion.qd for t in self.traces])
+        products = [qd[:, i, None] * qd[:, i:] for i in range(qd.shape[1])]
+        E = np.concatenate([np.delete(qd, joint, 1), *products], 1) * self._weight(joint)[:, None]
+        V, largest = _beside(basis, E)
+        U, taken = np.concatenate([basis.U, V], 1), basis.taken + self.moments(V)
+        wider = dataclasses.replace(basis, U=U, largest=largest, taken=taken)
+        if not wider.tells:
+            return basis
+        r, own = self._residual(joint), [basis.U, V]
+        before, after = r @ r - np.cumsum([np.sum((A.T @ r) ** 2) for A in own])
+        bar = max(2.0, basis.count ** (V.shape[1] / basis.count))
+        return wider if before > bar * max(after, 1e-300) else basis
 
     def _residual(self, joint: int) -> Float[np.ndarray, " _rows"]:
         """Measured less modelled torque, by what each row weighs."""
@@ -266,6 +258,15 @@ class Saturation:
         for trace in self.traces:  # made once, before there are threads
             trace.motion.regressor, trace.motion.load, trace.shaken  # noqa: B018
         return parallel(one, range(self.traces[0].motion.dof))
+
+
+def _beside(basis: _Basis, E: Float[np.ndarray, "_rows _n"]) -> tuple[Float[np.ndarray, "_rows _m"], float]:
+    """An orthonormal basis of what further columns add to one, and the largest singular value of either."""
+    U, largest = basis.U, max(basis.largest, float(np.linalg.norm(E, 2)))
+    for _ in range(2):  # once would leave rounding of what is taken off
+        E = E - U @ (U.T @ E)
+    V, s, _ = np.linalg.svd(E, full_matrices=False)
+    return V[:, s > _RANK * largest], largest
 
 
 def borne_out(

@@ -456,14 +456,14 @@ def transferable(problem: Problem, state: State) -> State:
     """
     state = with_terms(problem, [t for i, t in enumerate(state.terms) if not is_undetermined(state, i)])
     while lasting := [i for i, t in enumerate(state.terms) if not t.effect.bound_to_recording]:
-        whole, users = (float(sum(x)) for x in problem.predicted_error(state.design, state.noise)[:2])
+        whole, users, _ = (float(x.sum()) for x in problem.predicted_error(state.design, state.noise))
         drifting = any(state.terms[i].effect.drifts for i in lasting)
-        spread = problem.predicted_error(state.design, state.noise, spread=True)[0] if drifting else ()
+        spread = problem.predicted_error(state.design, state.noise, spread=True)[0].sum() if drifting else 0.0
         harm = {}
         for i in lasting:
             drifts = state.terms[i].effect.drifts
             less = problem.predicted_error(without(state, i), state.noise, spread=drifts)[0]
-            harm[i] = (float(sum(spread)) if drifts else whole) - float(sum(less))
+            harm[i] = (float(spread) if drifts else whole) - float(less.sum())
         worst = max(harm, key=lambda i: harm[i])
         if harm[worst] > 0:
             state = with_terms(problem, (*state.terms[:worst], *state.terms[worst + 1 :]))
