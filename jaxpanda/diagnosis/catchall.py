@@ -62,7 +62,8 @@ def build(traces: Sequence[Trace]) -> list[Candidates]:
     of_drives = any(t.motion.transmitted is not None for t in traces)  # which feel links by their load alone
     if knots[0] > _SLOW and not of_drives:
         alike["spin", 0].append(UnknownSpin(dof))
-        alike["drag", 0] += [UnknownDrag(dof, reach, tuple(knots.tolist())) for reach in _REACHES]
+        slides = bool(traces[0].motion.arm.chain.prismatic[-1])
+        alike["drag", 0] += [UnknownDrag(dof, reach, tuple(knots.tolist()), slides) for reach in _REACHES]
 
     def evaluated(same: list[Free]) -> list[Candidates]:
         columns = [columns_of(same, trace) for trace in traces]

@@ -243,7 +243,7 @@ class UnknownDrag(AbstractArmEffect):
 
     v is the velocity of the point at `reach` along the link's z axis [m]; f is piecewise linear, none at rest,
     with a coefficient for its value at each knot, constant beyond the last. A hose that is dragged along gives
-    such a force, a fluid, and a tool that rubs. The last joint, which turns about that axis, does not feel it.
+    such a force, a fluid, and a tool that rubs. A last joint that turns does so about that axis, and feels none.
     """
 
     name: ClassVar[str] = "unknown"
@@ -254,6 +254,8 @@ class UnknownDrag(AbstractArmEffect):
     reach: float = eqx.field(static=True)
     knots: tuple[float, ...] = eqx.field(static=True)
     """Of the speed [m/s], from the first above rest."""
+    slides: bool = eqx.field(static=True, default=False)
+    """Whether the last joint does."""
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownDrag"]:
@@ -261,7 +263,7 @@ class UnknownDrag(AbstractArmEffect):
 
     @property
     def joints(self) -> tuple[int, ...]:
-        return tuple(range(max(self.dof - 1, 1)))
+        return tuple(range(self.dof if self.slides else max(self.dof - 1, 1)))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
