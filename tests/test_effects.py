@@ -270,6 +270,20 @@ def test_torque_may_lead_and_a_single_joint_may_lag(motion):
     assert [(p["joint"], p["value"]) for p in told] == [(4, -d)]
 
 
+def test_a_filter_of_first_order_gives_what_it_is_solved_for(motion):
+    T = 0.05
+    lag = TimeDelay(7, T, "whole lag", 3)
+    shown = motion.torque + lag.over(motion)[..., 0] * T
+    fine = scipy.integrate.solve_ivp(
+        lambda t, y: (np.interp(t, motion.time, motion.torque[:, 3]) - y) / T,
+        motion.time[[0, -1]], shown[:1, 3], t_eval=motion.time, rtol=1e-9, atol=1e-9, max_step=motion.dt,
+    )  # fmt: skip
+    np.testing.assert_allclose(shown[:, 3], fine.y[0], atol=1e-4)
+    np.testing.assert_array_equal(np.delete(shown, 3, 1), np.delete(motion.torque, 3, 1))
+    (told,) = lag.parameters(np.array([T]), np.eye(1))
+    assert (told["name"], told["joint"], told["value"]) == ("time_constant", 4, T)
+
+
 def test_a_stiff_joint_deflects_by_its_torque_over_its_stiffness(motion):
     K = 2e5
     found = JointElasticity(1, K, 0.2).over(motion)[50:-50, :, 0]

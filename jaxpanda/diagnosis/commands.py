@@ -22,7 +22,7 @@ from ..rollout import compare
 from ..session import telling
 from . import meaning, page, resting, two_sided
 from .diagnosis import Diagnosis
-from .entry import diagnose, predict_sides
+from .entry import diagnosed, predict_sides
 from .host import on_host
 from .knowledge import Knowledge
 
@@ -80,11 +80,11 @@ def diagnose_files(
         )
         every = distinct([*suspect, *healthy])
         suspect, healthy = every[: len(suspect)], every[len(suspect) :]
-        found = diagnose(
+        found = diagnosed(
             model,
             suspect,
-            reference=healthy,
-            knowledge=knowledge,
+            healthy,
+            knowledge,
             gravity=convention.mounting,
             progress=lambda line: say(plainly(line)),
         )

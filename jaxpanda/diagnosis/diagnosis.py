@@ -81,6 +81,11 @@ class Diagnosis:
         """Text of the corrected MJCF."""
         return self.written.text
 
+    @property
+    def bare(self) -> "Diagnosis":
+        """The same, without what its search keeps and can be made again."""
+        return dataclasses.replace(self, problem=self.problem.bare)
+
     @functools.cached_property
     def localisation(self) -> tuple[Localisation, Localisation]:
         """What stands out of noise before anything was added to the model, and after."""

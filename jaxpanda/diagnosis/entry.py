@@ -61,6 +61,20 @@ def diagnose(
         InputError: a file that cannot be read, a recording that does not fit the model, or one given twice; an
             effect that is none, or whose name is taken.
     """
+    found = diagnosed(model, recordings, reference, knowledge, gravity, effects, progress)
+    return found.bare if isinstance(found, Diagnosis | TwoSided) else found
+
+
+def diagnosed(
+    model: Model | None,
+    recordings: Sequence[str | Path | Recording],
+    reference: Sequence[str | Path | Recording],
+    knowledge: knowledge_.Knowledge,
+    gravity: Sequence[float] | None = None,
+    effects: Sequence[type[AbstractEffect]] = (),
+    progress: Say = silent,
+) -> Diagnosis | TwoSided | AtRest | Misread:
+    """`diagnose`, with all that its search keeps: for who writes a report, and then is done with it."""
     require_x64("a diagnosis")
     catalogue = catalogue_with(effects)
     knowledge_.check(knowledge)

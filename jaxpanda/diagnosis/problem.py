@@ -123,6 +123,11 @@ class Problem:
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)} | {"shapes": None}
 
     @property
+    def bare(self) -> "Problem":
+        """The same, without what a search keeps and can be made again: most of what it takes in memory."""
+        return dataclasses.replace(self, saturated=None, shapes=None)
+
+    @property
     def arm(self) -> Arm:
         """The nominal one."""
         return self.traces[0].motion.arm

@@ -60,6 +60,11 @@ class TwoSided:
     replays: tuple[Mapping[str, Any], ...] = ()
 
     @property
+    def bare(self) -> "TwoSided":
+        """The same, without what its searches keep and can be made again."""
+        return dataclasses.replace(self, link=self.link.bare, drive=self.drive.bare)
+
+    @property
     def source(self) -> MjcfSource:
         return self.link.source
 

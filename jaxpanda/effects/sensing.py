@@ -1,13 +1,14 @@
 """What the sensors add: offsets, scales, drift, crosstalk, and clocks out of step."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.signal
 from jaxtyping import Array, Float
 
 from ..arms.arm import Arm
@@ -262,6 +263,9 @@ class TimeDelay(AbstractArmEffect):
     the coefficient is $|d|$ near $|d_0|$. In form "smooth" the torque of the rigid arm is low-passed: the
     residual is made of the same noise of q, differentiated twice, and what is shifted by half of its period would
     cancel it. Form "whole", without, is tried where there is evidence of the smooth one.
+
+    In forms that end in "lag" it is late by a filter of first order, $T \dot\tau_{measured} = \tau -
+    \tau_{measured}$, which takes of fast torque also its size; the coefficient is $T$.
     """
 
     name: ClassVar[str] = "time_delay"
@@ -282,11 +286,11 @@ class TimeDelay(AbstractArmEffect):
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["TimeDelay"]:
-        of_all = [(d, None) for d in (0.002, 0.005, 0.01, 0.02, 0.04)]
-        of_one = [(d, j) for d in (0.004, 0.015) for j in range(arm.dof)]
-        return [
-            cls(arm.dof, d, form, j) for form in ("smooth", "smooth ahead") for d, j in (*of_all, *of_one)
-        ]
+        shifts = [(d, None) for d in (0.002, 0.005, 0.01, 0.02, 0.04)]
+        shifts += [(d, j) for d in (0.004, 0.015) for j in range(arm.dof)]
+        filters = [(T, j) for T in (0.01, 0.03, 0.1) for j in (None, *range(arm.dof))]
+        forms = {"smooth": shifts, "smooth ahead": shifts, "smooth lag": filters}
+        return [cls(arm.dof, d, form, j) for form, tried in forms.items() for d, j in tried]
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -294,11 +298,17 @@ class TimeDelay(AbstractArmEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("delay", "s", sign=1, scale=0.02),)
+        return (Coefficient("time_constant" if self._filters else "delay", "s", sign=1, scale=0.02),)
 
     @property
     def equation(self) -> str:
+        if self._filters:
+            return "time_constant * d/dt tau_measured = tau - tau_measured"
         return "tau_measured(t) = tau(t - delay)"
+
+    @property
+    def _filters(self) -> bool:
+        return self.form.endswith("lag")
 
     @property
     def _sign(self) -> float:
@@ -309,22 +319,34 @@ class TimeDelay(AbstractArmEffect):
         cutoff = _DELAY_CUTOFF if self.form.startswith("smooth") else np.inf
         load = low_passed(motion.load[:, joints], cutoff, motion.dt)
         torque, then = load + motion.friction[:, joints], motion.time - self._sign * d
+        if self._filters:
+            kept = np.exp(-motion.dt / d)
+            ramp = (1 - kept) * d / motion.dt
+            b, a, whole = [1 - ramp, ramp - kept], [1, -kept], _with_before(torque)
+            late = scipy.signal.lfilter(b, a, whole, axis=0, zi=ramp * whole[:1])[0][-len(torque) :]
+        else:
+            late = np.stack([np.interp(then, motion.time, tau) for tau in torque.T], 1)
         out = np.zeros((motion.samples, motion.dof, 1))
-        for j, tau in zip(joints, torque.T, strict=True):
-            out[:, j, 0] = (np.interp(then, motion.time, tau) - tau) / d
+        out[:, joints, 0] = (late - torque) / d
         return out
 
     def sensed(self, c, t, tau):
-        return self._moved(t, tau, -self._sign * c[0])
+        late = _filtered if self._filters else self._late
+        return self._changed(tau, lambda x: late(t, x, c[0]))
 
     def true(self, c, t, tau):
-        return self._moved(t, tau, self._sign * c[0])
+        """Of a filter, with the derivative of what it gave, which has its noise."""
+        undone = lambda x: x + c[0] * jnp.gradient(x, axis=0) / jnp.gradient(t)[:, None]
+        return self._changed(tau, undone if self._filters else lambda x: self._late(t, x, -c[0]))
 
-    def _moved(self, t, tau, by):
+    def _late(self, t: Array, x: Float[Array, "time dof"], by: Array) -> Float[Array, "time dof"]:
+        return _shifted(t, x, -self._sign * by)
+
+    def _changed(self, tau, change: Callable[[Array], Array]):
         if self.joint is None:
-            return _shifted(t, tau, by)
+            return change(tau)
         one = slice(self.joint, self.joint + 1)
-        return jnp.asarray(tau).at[:, one].set(_shifted(t, tau[:, one], by))
+        return jnp.asarray(tau).at[:, one].set(change(tau[:, one]))
 
     def parameters(self, c, covariance):
         (delay,) = super().parameters(c, covariance)
@@ -335,6 +357,24 @@ class TimeDelay(AbstractArmEffect):
 def _shifted(t: Array, x: Float[Array, "time dof"], by: Array) -> Float[Array, "time dof"]:
     """x(t + by), held at its ends."""
     return jax.vmap(lambda column: jnp.interp(t + by, t, column), 1, 1)(x)
+
+
+def _with_before(x: Float[Array | np.ndarray, "time dof"]) -> Float[Array | np.ndarray, "2*time-1 dof"]:
+    """With what was before, as far as that can be told: the slope at the start is kept, and rest stays rest."""
+    xp = np if isinstance(x, np.ndarray) else jnp
+    return xp.concatenate([2 * x[:1] - x[:0:-1], x])
+
+
+def _filtered(t: Array, x: Float[Array, "time dof"], T: Array | float) -> Float[Array, "time dof"]:
+    """x past a low pass of first order; x is straight between its samples."""
+    h, whole = jnp.diff(t)[:, None], _with_before(x)
+    h = jnp.concatenate([h[::-1], h])
+    kept = jnp.exp(-h / jnp.maximum(T, 1e-9))
+    ramp = (1 - kept) * T / h
+    y = (1 - ramp) * whole[1:] + (ramp - kept) * whole[:-1]
+    along = lambda a, b: (a[0] * b[0], b[0] * a[1] + b[1])
+    every = jax.lax.associative_scan(along, (jnp.broadcast_to(kept, y.shape), y))
+    return (every[0] * whole[0] + every[1])[len(x) - 2 :]
 
 
 _DELAY_CUTOFF = 6.0
