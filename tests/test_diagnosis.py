@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 from helpers import NOISE, excitation, record
 from helpers import result as held
 
@@ -131,6 +132,13 @@ def test_the_heat_map_is_hottest_where_the_effect_was_concealed(found):
     assert np.nanmax(heat.beside) < 0.05 * row[4]
 
 
+def test_a_result_keeps_no_working_memory_of_its_search_and_says_the_same(found):
+    whole = found.to_json()
+    assert set(vars(found.bare.problem)) == {f.name for f in dataclasses.fields(found.problem)}
+    assert found.bare.problem.shapes is found.bare.problem.saturated is None
+    assert found.bare.to_json() == whole
+
+
 def test_the_page_stands_alone_and_escapes_what_users_named(found, tmp_path):
     sources = ({"role": "recording", "name": "<script>alert(1)</script>.csv", "sha256": "0"},)
     shown = dataclasses.replace(found, sources=sources)
@@ -178,6 +186,18 @@ def test_a_contact_is_found_in_its_interval_and_kept_out_of_predictions(tmp_path
     result.save(tmp_path / "out")
     error = predict(tmp_path / "out", record(7)) - record(7).tau
     np.testing.assert_allclose(np.sqrt(np.mean(error**2, 0)), NOISE, rtol=0.1)
+
+
+@pytest.mark.slow
+def test_a_torque_sensor_that_is_filtered_is_late_by_the_filter_s_time_constant():
+    T, recording = 0.1, record(5)
+    kept = np.exp(-(recording.time[1] - recording.time[0]) / T)
+    tau = recording.tau.copy()
+    tau[:, 2] = scipy.signal.lfilter([1 - kept], [1, -kept], tau[:, 2], zi=kept * tau[:1, 2])[0]
+    result = diagnose(None, [dataclasses.replace(recording, tau=tau)])
+    (one,) = result.findings
+    assert (one.effect, one.joints) == ("time_delay", (2,))
+    np.testing.assert_allclose(one.parameters[0]["value"], T, rtol=0.1)
 
 
 @pytest.mark.slow

@@ -280,8 +280,10 @@ def test_a_filter_of_first_order_gives_what_it_is_solved_for(motion):
     )  # fmt: skip
     np.testing.assert_allclose(shown[:, 3], fine.y[0], atol=1e-4)
     np.testing.assert_array_equal(np.delete(shown, 3, 1), np.delete(motion.torque, 3, 1))
+    half = lag.sensed(jnp.array([T / 2]), jnp.asarray(motion.time), jnp.asarray(motion.torque))
+    np.testing.assert_allclose(half, motion.torque + lag.over(motion)[..., 0] * T / 2, atol=1e-9)
     (told,) = lag.parameters(np.array([T]), np.eye(1))
-    assert (told["name"], told["joint"], told["value"]) == ("time_constant", 4, T)
+    assert (told["name"], told["joint"], told["value"]) == ("delay", 4, T)
 
 
 def test_a_stiff_joint_deflects_by_its_torque_over_its_stiffness(motion):

@@ -70,7 +70,26 @@ def laws(problem: Problem, log: list[str] | None = None, terms: Sequence[Term] =
         common = with_terms(problem, everywhere(problem, state.noise))
         other = climb(problem, common, say, free=False, met=names(state))
         if names(other) != names(state):
-            state = _likelier(problem, state, other, say)
+            best = _likelier(problem, state, other, say)
+            state = crossed(problem, best, other if best is state else state, say)
+    return state
+
+
+def crossed(problem: Problem, state: State, other: State, say: Any) -> State:
+    """With the terms of another model at each joint where the model is likelier with them: steps that began
+    elsewhere may have ended better at some joints though not on the whole."""
+    at = lambda terms, joint: [t for t in terms if t.effect.joints == (joint,)]
+    for joint in range(problem.dof):
+        own, new = at(state.terms, joint), at(other.terms, joint)
+        if sorted(map(name, own)) == sorted(map(name, new)):
+            continue
+        kept = [t for t in state.terms if all(t is not o for o in own)]
+        changed = with_terms(problem, (*kept, *new))
+        gained = likelier((problem, state), (problem, changed))
+        if gained > BETTER:
+            list_ = lambda terms: ", ".join(map(name, terms)) or "nothing"
+            say(f"{list_(new)} for {list_(own)}: likelier by {gained:.1f}")
+            state = changed
     return state
 
 

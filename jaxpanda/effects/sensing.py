@@ -264,8 +264,9 @@ class TimeDelay(AbstractArmEffect):
     residual is made of the same noise of q, differentiated twice, and what is shifted by half of its period would
     cancel it. Form "whole", without, is tried where there is evidence of the smooth one.
 
-    In forms that end in "lag" it is late by a filter of first order, $T \dot\tau_{measured} = \tau -
-    \tau_{measured}$, which takes of fast torque also its size; the coefficient is $T$.
+    Form "lag" is a filter of first order, $\tau_{measured} = \tau + (d / d_0) (F \tau - \tau)$ with
+    $d_0 \dot{F \tau} = \tau - F \tau$, which takes of fast torque also its size. It delays slow torque by d; with
+    $d \ne d_0$ it is nearest to a filter of another order.
     """
 
     name: ClassVar[str] = "time_delay"
@@ -298,12 +299,12 @@ class TimeDelay(AbstractArmEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("time_constant" if self._filters else "delay", "s", sign=1, scale=0.02),)
+        return (Coefficient("delay", "s", sign=1, scale=0.02),)
 
     @property
     def equation(self) -> str:
         if self._filters:
-            return "time_constant * d/dt tau_measured = tau - tau_measured"
+            return "tau_measured = tau + delay / T * (y - tau), T * dy/dt = tau - y"
         return "tau_measured(t) = tau(t - delay)"
 
     @property
@@ -331,16 +332,20 @@ class TimeDelay(AbstractArmEffect):
         return out
 
     def sensed(self, c, t, tau):
-        late = _filtered if self._filters else self._late
-        return self._changed(tau, lambda x: late(t, x, c[0]))
+        return self._changed(tau, lambda x: self._late(t, x, c[0]))
 
     def true(self, c, t, tau):
         """Of a filter, with the derivative of what it gave, which has its noise."""
-        undone = lambda x: x + c[0] * jnp.gradient(x, axis=0) / jnp.gradient(t)[:, None]
-        return self._changed(tau, undone if self._filters else lambda x: self._late(t, x, -c[0]))
+        if not self._filters:
+            return self._changed(tau, lambda x: self._late(t, x, -c[0]))
+        T = self.around
+        steeper = lambda y: y + T * jnp.gradient(y, axis=0) / jnp.gradient(t)[:, None]
+        return self._changed(tau, lambda y: _filtered(t, steeper(y), T - c[0]))
 
-    def _late(self, t: Array, x: Float[Array, "time dof"], by: Array) -> Float[Array, "time dof"]:
-        return _shifted(t, x, -self._sign * by)
+    def _late(self, t: Array, x: Float[Array, "time dof"], d: Array) -> Float[Array, "time dof"]:
+        if self._filters:
+            return x + d / self.around * (_filtered(t, x, self.around) - x)
+        return _shifted(t, x, -self._sign * d)
 
     def _changed(self, tau, change: Callable[[Array], Array]):
         if self.joint is None:
@@ -367,9 +372,9 @@ def _with_before(x: Float[Array | np.ndarray, "time dof"]) -> Float[Array | np.n
 
 def _filtered(t: Array, x: Float[Array, "time dof"], T: Array | float) -> Float[Array, "time dof"]:
     """x past a low pass of first order; x is straight between its samples."""
-    h, whole = jnp.diff(t)[:, None], _with_before(x)
+    h, whole, T = jnp.diff(t)[:, None], _with_before(x), jnp.maximum(T, 1e-9)
     h = jnp.concatenate([h[::-1], h])
-    kept = jnp.exp(-h / jnp.maximum(T, 1e-9))
+    kept = jnp.exp(-h / T)
     ramp = (1 - kept) * T / h
     y = (1 - ramp) * whole[1:] + (ramp - kept) * whole[:-1]
     along = lambda a, b: (a[0] * b[0], b[0] * a[1] + b[1])
