@@ -76,8 +76,9 @@ def laws(problem: Problem, log: list[str] | None = None, terms: Sequence[Term] =
 
 
 def crossed(problem: Problem, state: State, other: State, say: Any) -> State:
-    """With the terms of another model at each joint where the model is likelier with them: steps that began
-    elsewhere may have ended better at some joints though not on the whole."""
+    """With the terms of another model at each joint where the model is likelier with them, by the recordings and
+    by what it predicts where it was not fitted too: steps that began elsewhere may have ended better at some
+    joints though not on the whole."""
     at = lambda terms, joint: [t for t in terms if t.effect.joints == (joint,)]
     for joint in range(problem.dof):
         own, new = at(state.terms, joint), at(other.terms, joint)
@@ -85,10 +86,10 @@ def crossed(problem: Problem, state: State, other: State, say: Any) -> State:
             continue
         kept = [t for t in state.terms if all(t is not o for o in own)]
         changed = with_terms(problem, (*kept, *new))
-        gained = likelier((problem, state), (problem, changed))
-        if gained > BETTER:
-            list_ = lambda terms: ", ".join(map(name, terms)) or "nothing"
-            say(f"{list_(new)} for {list_(own)}: likelier by {gained:.1f}")
+        gained = changed.score - state.score
+        if gained > BETTER and likelier((problem, state), (problem, changed)) > 0:
+            said = [", ".join(map(name, some)) or "nothing" for some in (new, own)]
+            say(f"{said[0]} for {said[1]}: {gained:.1f}")
             state = changed
     return state
 
