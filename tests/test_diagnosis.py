@@ -32,7 +32,7 @@ from jaxpanda.diagnosis.noise import autoregression, moments
 from jaxpanda.diagnosis.posterior import posterior_of
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
-from jaxpanda.diagnosis.search import exchange, instead, transferable
+from jaxpanda.diagnosis.search import crossed, exchange, instead, transferable
 from jaxpanda.diagnosis.state import torque, with_terms
 from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.diagnosis.written import buildable, corrected_document, worsened
@@ -466,6 +466,22 @@ def test_a_much_likelier_rival_takes_a_term_s_place():
     assert [t.key for t in found.terms] == [("coulomb_friction", (3,))]
     again = exchange(problem, found, lambda _: None)
     assert [t.key for t in again.terms] == [t.key for t in found.terms]
+
+
+@pytest.mark.slow
+def test_of_two_models_each_joint_takes_the_likelier_terms():
+    """Each has the friction of one joint, and at the other an offset that is none."""
+    friction = lambda t, q, qd, qdd: np.tanh(qd / 0.01) * np.isin(np.arange(7), (1, 3)) * 0.6
+    problem = pose((prepare(record(3, friction), Arm.panda()),), (True,), "exact").problem
+    std, own = problem.noise(()).std, np.array([0.6])
+    rubs = [problem.term(CoulombFriction(j, 0.01), np.ones(1), own, std, -12.0) for j in (1, 3)]
+    offsets = [problem.term(TorqueOffset(j), np.array([0.1])) for j in (1, 3)]
+    first = with_terms(problem, [rubs[0], offsets[1]])
+    second = with_terms(problem, [offsets[0], rubs[1]])
+    for state, other in ((first, second), (second, first)):
+        best = crossed(problem, state, other, lambda _: None)
+        assert {id(t) for t in best.terms} == {id(t) for t in rubs}
+    assert crossed(problem, best, first, lambda _: None) is best
 
 
 @pytest.mark.slow
