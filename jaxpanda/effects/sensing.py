@@ -304,7 +304,7 @@ class TimeDelay(AbstractArmEffect):
     @property
     def equation(self) -> str:
         if self._filters:
-            return "tau_measured = tau + delay / T * (y - tau), T * dy/dt = tau - y"
+            return "tau_measured = tau past a low pass of first order, whose delay of slow torque is delay"
         return "tau_measured(t) = tau(t - delay)"
 
     @property
@@ -338,8 +338,8 @@ class TimeDelay(AbstractArmEffect):
         """Of a filter, with the derivative of what it gave, which has its noise."""
         if not self._filters:
             return self._changed(tau, lambda x: self._late(t, x, -c[0]))
-        T = self.around
-        steeper = lambda y: y + T * jnp.gradient(y, axis=0) / jnp.gradient(t)[:, None]
+        T, each = self.around, lambda x: jnp.asarray(jnp.gradient(x, axis=0))  # from row to row
+        steeper = lambda y: y + T * each(y) / each(t)[:, None]
         return self._changed(tau, lambda y: _filtered(t, steeper(y), T - c[0]))
 
     def _late(self, t: Array, x: Float[Array, "time dof"], d: Array) -> Float[Array, "time dof"]:
