@@ -29,7 +29,7 @@ from jaxpanda.effects.drive import Backlash, JointElasticity, JointSpring, Torqu
 from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.load import GravityDirection, InertialParameters, Payload, PayloadChange
 from jaxpanda.effects.memory import PreslidingHysteresis
-from jaxpanda.effects.sensing import EncoderOffset, TimeDelay, TorqueDrift
+from jaxpanda.effects.sensing import EncoderOffset, TimeDelay, TorqueDrift, TorqueGain
 from jaxpanda.effects.stribeck import StribeckBristles
 from jaxpanda.effects.twist import Law, twist_torque
 from jaxpanda.effects.unknown import (
@@ -249,6 +249,15 @@ def test_an_encoder_offset_is_the_change_of_torque_to_first_order(arm, motion):
 
 def test_an_encoder_offset_of_a_vertical_first_joint_does_not_show(motion):
     assert np.abs(EncoderOffset(0, 0.1).over(motion)).max() < 1e-9
+
+
+def test_a_torque_sensor_is_as_likely_to_show_half_as_double():
+    gain, s = TorqueGain(2), np.array([0.3])
+    log_prior = lambda c: gain.beyond_normal(np.array([c]), s) - 0.5 * (c / s[0]) ** 2
+    np.testing.assert_allclose(log_prior(1.0), log_prior(-0.5))
+    np.testing.assert_allclose(log_prior(1.0), -0.5 * (np.log(2) / s[0]) ** 2)
+    assert log_prior(-0.97) < log_prior(0.97) - 50
+    assert np.isfinite(log_prior(-1.2))
 
 
 def test_a_delay_reproduces_the_shifted_torque_where_it_was_linearised(motion):

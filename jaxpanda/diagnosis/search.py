@@ -139,6 +139,7 @@ def taken(problem: Problem, design: Design, noise: Noise, proposal: Proposal) ->
     """A proposal as a term beside what a design holds, with its discrepancy."""
     c, _ = fitted(problem, design, noise, proposal)
     prior = proposal.evidence - proposal.shared - proposal.best + proposal.effect.form_prior
+    prior += proposal.effect.beyond_normal(c, proposal.deviation)
     return problem.term(proposal.effect, proposal.deviation, c, noise.std, prior)
 
 

@@ -181,6 +181,11 @@ class AbstractEffect(eqx.Module):
         """What the form adds to `prior`."""
         return sum((part.prior for part in self.held), 0.0)
 
+    def beyond_normal(self, c: Float[np.ndarray, " n"], deviation: Float[np.ndarray, " n"]) -> float:
+        """Logarithm of how much likelier these coefficients are, beforehand, than with a normal prior of these
+        deviations [nats]."""
+        return 0.0
+
     @property
     def title(self) -> str:
         """Name of what it is: a law whose shape is that of another is called so."""

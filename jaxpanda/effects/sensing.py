@@ -77,6 +77,10 @@ class TorqueGain(AbstractInstantEffect):
     def equation(self) -> str:
         return "tau_measured = (1 + gain_error) * tau"
 
+    def beyond_normal(self, c, deviation):
+        """A gain is a factor, as likely halved as doubled: its logarithm is normal."""
+        return 0.5 * float((c[0] ** 2 - np.log(max(1 + c[0], 1e-3)) ** 2) / deviation[0] ** 2)
+
     def at(self, s: Channels) -> Float[Array, " n"]:
         return s.torque[self.joint][None]
 
