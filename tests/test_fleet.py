@@ -140,7 +140,7 @@ def test_a_defect_is_told_and_tried_again(resting, monkeypatch, tmp_path):
     def fails(*_, **__):
         raise ZeroDivisionError("of a library")
 
-    monkeypatch.setattr(work, "diagnose", fails)
+    monkeypatch.setattr(work, "diagnosed", fails)
     found = diagnose_fleet(resting / "fleet.csv", tmp_path, model=resting / "arm.xml")
     assert Counter(d["status"] for d in found.told.values()) == {"failed": 4, "unreadable": 2}
     assert found.told[1]["message"] == "left_0.csv: ZeroDivisionError: of a library"

@@ -8,20 +8,18 @@ each, without the result and what more it was with it [MiB].
 """
 
 import argparse
-import ctypes
-import gc
 import json
 import time
 from pathlib import Path
 
 import jaxpanda
 from jaxpanda import session
+from jaxpanda.diagnosis.host import return_freed
 
 
 def resident() -> float:
     """Of this process, what is free given back [MiB]."""
-    gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)
+    return_freed()
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024
 

@@ -119,8 +119,8 @@ class Problem:
     """Those of the same recordings and effects, likewise."""
 
     def __getstate__(self) -> dict[str, Any]:
-        """For pickle: the fields, without what can be made again."""
-        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)} | {"shapes": None}
+        """For pickle."""
+        return vars(self.bare)
 
     @property
     def bare(self) -> "Problem":

@@ -325,10 +325,10 @@ class TimeDelay(AbstractArmEffect):
         load = low_passed(motion.load[:, joints], cutoff, motion.dt)
         torque, then = load + motion.friction[:, joints], motion.time - self._sign * d
         if self._filters:
-            kept = np.exp(-motion.dt / d)
-            ramp = (1 - kept) * d / motion.dt
-            b, a, whole = [1 - ramp, ramp - kept], [1, -kept], _with_before(torque)
-            late = scipy.signal.lfilter(b, a, whole, axis=0, zi=ramp * whole[:1])[0][-len(torque) :]
+            kept, old, new = (float(x) for x in _low_pass(motion.dt, d))
+            whole = _with_before(torque)
+            settled = (1 - new) * whole[:1]
+            late = scipy.signal.lfilter([new, old], [1, -kept], whole, axis=0, zi=settled)[0][-len(torque) :]
         else:
             late = np.stack([np.interp(then, motion.time, tau) for tau in torque.T], 1)
         out = np.zeros((motion.samples, motion.dof, 1))
@@ -374,16 +374,23 @@ def _with_before(x: Float[Array | np.ndarray, "time dof"]) -> Float[Array | np.n
     return xp.concatenate([2 * x[:1] - x[:0:-1], x])
 
 
-def _filtered(t: Array, x: Float[Array, "time dof"], T: Array | float) -> Float[Array, "time dof"]:
-    """x past a low pass of first order; x is straight between its samples."""
-    h, whole, T = jnp.diff(t)[:, None], _with_before(x), jnp.maximum(T, 1e-9)
-    h = jnp.concatenate([h[::-1], h])
+def _low_pass(h: Array | float, T: Array | float) -> tuple[Array, Array, Array]:
+    """What a step of h takes of the last value of a low pass of first order, and of its last and new argument,
+    which is straight between."""
+    T = jnp.maximum(T, 1e-9)
     kept = jnp.exp(-h / T)
     ramp = (1 - kept) * T / h
-    y = (1 - ramp) * whole[1:] + (ramp - kept) * whole[:-1]
+    return kept, ramp - kept, 1 - ramp
+
+
+def _filtered(t: Array, x: Float[Array, "time dof"], T: Array | float) -> Float[Array, "time dof"]:
+    """x past a low pass of first order."""
+    h, whole = jnp.diff(t)[:, None], _with_before(x)
+    kept, old, new = _low_pass(jnp.concatenate([h[::-1], h]), T)
+    y = new * whole[1:] + old * whole[:-1]
     along = lambda a, b: (a[0] * b[0], b[0] * a[1] + b[1])
-    every = jax.lax.associative_scan(along, (jnp.broadcast_to(kept, y.shape), y))
-    return (every[0] * whole[0] + every[1])[len(x) - 2 :]
+    fades, later = jax.lax.associative_scan(along, (jnp.broadcast_to(kept, y.shape), y))
+    return jnp.concatenate([whole[:1], fades * whole[0] + later])[len(x) - 1 :]
 
 
 _DELAY_CUTOFF = 6.0

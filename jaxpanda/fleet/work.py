@@ -5,10 +5,7 @@ and the software. So whoever finds one that is there need not make it again, and
 bits.
 """
 
-import contextlib
-import ctypes
 import dataclasses
-import gc
 import hashlib
 import json
 import os
@@ -24,7 +21,9 @@ import numpy as np
 from .. import inputs
 from ..arms.source import from_mjcf
 from ..convention import PLAIN, Convention
-from ..diagnosis import Diagnosis, diagnose
+from ..diagnosis import Diagnosis
+from ..diagnosis.entry import diagnosed
+from ..diagnosis.host import on_host, return_freed
 from ..diagnosis.knowledge import Knowledge
 from ..errors import InputError
 from ..files import to_json
@@ -75,6 +74,7 @@ def refused(key: str, status: str, message: str) -> dict[str, Any]:
     return {"schema": SCHEMA, "key": key, "status": status, "message": message}
 
 
+@on_host
 def _diagnosed(task: Task) -> dict[str, Any]:
     options = task.options
     suspect, healthy = (
@@ -82,13 +82,8 @@ def _diagnosed(task: Task) -> dict[str, Any]:
         for paths in ([task.recording], task.references)
     )
     every = distinct([*suspect, *healthy])
-    found = diagnose(
-        task.model,
-        every[: len(suspect)],
-        reference=every[len(suspect) :],
-        knowledge=options.knowledge,
-        gravity=options.convention.mounting,
-    )
+    cut, gravity = len(suspect), options.convention.mounting
+    found = diagnosed(task.model, every[:cut], every[cut:], options.knowledge, gravity)
     fit = found.fit
     torque = np.sqrt(sum((np.square(f.rms_torque) for f in found.findings), np.zeros_like(fit.noise_floor)))
     return {
@@ -161,9 +156,7 @@ def software() -> str:
 def relieve() -> None:
     """Give back what compiled programs take; the next recordings compile, or read from the cache, again."""
     jax.clear_caches()
-    gc.collect()
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
+    return_freed()
 
 
 def memory() -> int:
