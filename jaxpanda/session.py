@@ -1,6 +1,8 @@
 """What the commands switch on before they work: float64, a compilation cache, progress bars."""
 
 import contextlib
+import ctypes
+import functools
 import os
 import re
 import sys
@@ -21,9 +23,12 @@ from rich.progress import (
 )
 from rich.text import Text
 
+_ARENA_MAX, _ARENAS = -8, 2
+"""glibc's name for how many arenas threads take memory from, and how many: more hold on to what is free."""
+
 
 def start() -> None:
-    """Float64, and compiled programs kept from one run to the next.
+    """Float64, compiled programs kept from one run to the next, and memory that threads share.
 
     The cache lies in `$JAXPANDA_CACHE`, or `~/.cache/jaxpanda`; an empty `JAXPANDA_CACHE` switches it off.
     """
@@ -32,6 +37,14 @@ def start() -> None:
     if folder and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    _share_memory()
+
+
+@functools.cache
+def _share_memory() -> None:
+    """Once, as glibc wants it set before threads go by it."""
+    with contextlib.suppress(AttributeError, OSError):  # another C library
+        ctypes.CDLL(None).mallopt(_ARENA_MAX, _ARENAS)
 
 
 def spread_over_cores() -> None:

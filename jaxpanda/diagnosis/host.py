@@ -14,8 +14,6 @@ from threadpoolctl import threadpool_limits
 
 P = ParamSpec("P")
 R = TypeVar("R")
-_ARENA_MAX, _ARENAS = -8, 2
-"""glibc's name for how many arenas threads take memory from, and how many: more hold on to what is free."""
 _THREADS = 4
 """At most: more wait for Python's lock, and slow down those that hold it."""
 
@@ -29,7 +27,6 @@ def on_host(work: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(work)
     def alone(*args: P.args, **kwargs: P.kwargs) -> R:
-        _libc("mallopt", _ARENA_MAX, _ARENAS)
         with contextlib.ExitStack() as stack:
             stack.enter_context(threadpool_limits(limits=1, user_api="blas"))
             if jax.default_backend() != "cpu":
@@ -49,13 +46,8 @@ def return_freed() -> None:
     A process that diagnosed again and again held 2.4 GB, of which 0.6 were in use.
     """
     gc.collect()  # arrays of objects that refer to each other
-    _libc("malloc_trim", 0)
-
-
-def _libc(name: str, *args: int) -> None:
-    """Call glibc; nothing happens where another C library is."""
-    with contextlib.suppress(AttributeError, OSError):
-        getattr(ctypes.CDLL(None), name)(*args)
+    with contextlib.suppress(AttributeError, OSError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def parallel(work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
