@@ -40,7 +40,7 @@ from .errors import InputError, require_x64
 from .friction import Friction
 from .recordings import Recording
 from .signals import Signals, derivatives, prepare, zero_phase
-from .xla import options
+from .xla import chunked, options
 
 FILE = "validation.json"
 KIND = files.Kind("validate", (FILE,))
@@ -403,7 +403,7 @@ def _relative(errors: np.ndarray, measured: np.ndarray) -> float:
 
 def _kernel_inverse(arm: Arm, q, qd, qdd) -> Float[np.ndarray, "time dof"]:
     smooth = dataclasses.replace(arm, frictionloss=jnp.zeros(arm.dof))
-    return np.asarray(_inverse_dynamics(smooth, *map(jnp.asarray, (q, qd, qdd))))
+    return chunked(_inverse_dynamics, smooth.nameless, q, qd, qdd)
 
 
 @jax.jit
@@ -494,11 +494,10 @@ def torque_rmse(arm: Arm, recordings: Sequence[Recording], cutoff: float = 5.0) 
 
 def _torque_error(arm: Arm, friction: Friction | None, signals: Signals) -> TorqueError:
     assert signals.tau is not None
-    qd = jnp.asarray(signals.qd)
-    tau = _inverse_dynamics(arm, jnp.asarray(signals.q), qd, jnp.asarray(signals.qdd))
+    tau = chunked(_inverse_dynamics, arm.nameless, signals.q, signals.qd, signals.qdd)
     if friction is not None:
-        tau = tau + friction.torque(qd)
-    measured, modelled = signals.lowpass(signals.tau), signals.lowpass(np.asarray(tau))
+        tau = tau + np.asarray(friction.torque(jnp.asarray(signals.qd)))
+    measured, modelled = signals.lowpass(signals.tau), signals.lowpass(tau)
     return TorqueError(
         name=signals.name,
         rmse=_rms(measured - modelled),

@@ -1,10 +1,14 @@
-"""How XLA compiles large programs for a CPU."""
+"""What XLA compiles: programs that recordings of any length share, and options for large ones on a CPU."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import numpy as np
 
+_CHUNK = 1024
+"""Samples that one compiled call takes."""
 _ON_CPU = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 
 
@@ -29,3 +33,18 @@ def options(platform: str | None = None) -> dict[str, Any] | None:
     except jax.errors.JaxRuntimeError:  # of another version
         return None
     return _ON_CPU
+
+
+def chunked(function: Callable, arm: Any, *arrays: np.ndarray) -> np.ndarray:
+    """`function(arm, *arrays)` in chunks of one shape: recordings of any length share its compilation."""
+    out = []
+    for start in range(0, len(arrays[0]), _CHUNK):
+        parts = [filled(a[start : start + _CHUNK], _CHUNK) for a in arrays]
+        out.append(np.asarray(function(arm, *parts)))
+    return np.concatenate(out)[: len(arrays[0])]
+
+
+def filled(a: np.ndarray, length: int) -> np.ndarray:
+    """Rows up to a length, the last one again and again."""
+    short = length - len(a)
+    return np.concatenate([a, np.repeat(a[-1:], short, 0)]) if short else a

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxpanda import Arm, Recording
+from jaxpanda import Arm, Recording, validation
 from jaxpanda import signals as signals_
 from jaxpanda.diagnosis import search
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.shapes import _score
 from jaxpanda.diagnosis.traces import prepare
-from jaxpanda.effects import Channels, Stretches, joint_columns
+from jaxpanda.effects import Channels, Motion, Stretches, joint_columns
 from jaxpanda.effects import effect as effect_
+from jaxpanda.effects import motion as motion_
 from jaxpanda.effects.drive import TorqueRipple
 from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
@@ -47,6 +48,27 @@ def test_a_recording_of_another_length_compiles_nothing_new():
     for samples in (50, 2048, 5000):
         assert joint_columns(effects, Stretches(channels(samples)), 0.002).shape == (samples, 2, 1)
     assert effect_._advance._cache_size() == before
+
+
+def test_another_arm_with_as_many_joints_compiles_its_dynamics_alone():
+    def torques(arm: Arm, samples: int):
+        s = channels(samples)
+        motion = Motion(arm, s.t, s.q, s.qd, s.qdd, np.zeros_like(s.q))
+        validation.torque_rmse(arm, [recording(samples, 4.0)])
+        return motion.load, motion.regressor, motion.gravity_columns, motion.wrench_columns, motion.inertia
+
+    shared = (
+        motion_._regressor,
+        motion_._gravity_columns,
+        motion_._wrench_columns,
+        validation._inverse_dynamics,
+    )
+    arm = Arm.panda()
+    torques(arm, 1500)
+    before = [program._cache_size() for program in shared]
+    other = dataclasses.replace(arm, name="another", joint_names=tuple("abcdefg"), lumped=0.1 * arm.standard)
+    torques(dataclasses.replace(other, standard=1.1 * arm.standard, armature=arm.armature + 0.1), 700)
+    assert [program._cache_size() for program in shared] == before
 
 
 @pytest.mark.parametrize("effect", [CoulombFriction(1, 0.01), PreslidingHysteresis(1, 0.01, "jenkins whole")])

@@ -70,6 +70,19 @@ class Arm(eqx.Module):
     def dof(self) -> int:
         return self.chain.dof
 
+    @property
+    def nameless(self) -> "Arm":
+        """What its torque goes by, without names and limits: arms of as many joints share what is compiled."""
+        free = jnp.full(self.dof, jnp.inf)
+        return Arm(
+            **{name: getattr(self, name) for name in ("chain", "standard", *KNOWN)},
+            lower=-free,
+            upper=free,
+            joint_names=(),
+            link_names=(),
+            name="",
+        )
+
     def to_json(self) -> dict[str, Any]:
         """Everything, as numbers and names; null for a limit that is infinite."""
         return {

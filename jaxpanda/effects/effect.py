@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arms.arm import Arm
-from .motion import Channels, Motion, filled
+from ..xla import filled
+from .motion import Channels, Motion
 
 Numbers = Float[Array, " n"] | Float[np.ndarray, " n"]
 """Coefficients, which may be traced."""

@@ -12,9 +12,7 @@ from jaxpanda_kernels import batched, link_poses, mass_matrix, regressor, rnea
 from jaxtyping import Array, Float, Int
 
 from ..arms.arm import Arm
-
-_CHUNK = 1024
-"""Samples that one compiled call takes: recordings of any length share its compilation."""
+from ..xla import chunked
 
 
 class Channels(eqx.Module):
@@ -81,7 +79,7 @@ class Motion:
         """Torque of the links alone, were these their standard parameters, or a change of them [N m]: the
         regressor times them, without its time and memory."""
         arm = dataclasses.replace(self.arm, standard=jnp.asarray(standard))
-        return _chunked(_rigid_torque, arm, self.q, self.qd, self.qdd)
+        return chunked(_rigid_torque, arm.nameless, self.q, self.qd, self.qdd)
 
     @functools.cached_property
     def gravity_columns(self) -> Float[np.ndarray, "time dof 3"]:
@@ -137,12 +135,12 @@ class Motion:
         return self.load + self.friction
 
     def _over(self, function: Callable, *arrays: np.ndarray) -> np.ndarray:
-        return _chunked(function, self.arm, *arrays)
+        return chunked(function, self.arm.nameless, *arrays)
 
 
 def masses(arm: Arm, q: Float[np.ndarray, "poses dof"]) -> Float[np.ndarray, "poses dof dof"]:
     """The mass matrix with armature in some poses [kg m²]."""
-    return _chunked(_masses, arm, q)
+    return chunked(_masses, arm.nameless, q)
 
 
 def slopes(
@@ -152,22 +150,7 @@ def slopes(
     qdd: Float[np.ndarray, "states dof"],
 ) -> Float[np.ndarray, "states dof dof"]:
     """Derivative of the smooth torque by the joint positions [N m/rad]."""
-    return _chunked(_slopes, arm, q, qd, qdd)
-
-
-def _chunked(function: Callable, arm: Arm, *arrays: np.ndarray) -> np.ndarray:
-    """`function(arm, *arrays)` in chunks of one shape."""
-    out = []
-    for start in range(0, len(arrays[0]), _CHUNK):
-        parts = [filled(a[start : start + _CHUNK], _CHUNK) for a in arrays]
-        out.append(np.asarray(function(arm, *parts)))
-    return np.concatenate(out)[: len(arrays[0])]
-
-
-def filled(a: np.ndarray, length: int) -> np.ndarray:
-    """Rows up to a length, the last one again and again."""
-    short = length - len(a)
-    return np.concatenate([a, np.repeat(a[-1:], short, 0)]) if short else a
+    return chunked(_slopes, arm.nameless, q, qd, qdd)
 
 
 def smooth_torque(arm: Arm, q: Array, qd: Array, qdd: Array) -> Array:

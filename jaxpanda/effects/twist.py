@@ -96,7 +96,8 @@ def low_passed(x: Float[np.ndarray, "time ..."], cutoff: float, dt: float) -> Fl
 def _stepped(
     channels: Sequence[Float[np.ndarray, "fine m"]], motion: Motion, laws: Sequence[Law], h: float
 ) -> list[Float[np.ndarray, "fine m"]]:
-    """Twist and its two derivatives; sizes are padded so that motions and batches share compilations."""
+    """Twist and its two derivatives, a stretch after the other and some laws at once: any motion, any number of
+    laws share what is compiled."""
     samples, m = channels[0].shape
     pad = ((0, -samples % _BUCKET), (0, -m % _LANES))
     padded = [np.pad(x, pad, mode="edge") for x in channels]
@@ -113,11 +114,27 @@ def _stepped(
         ]
     )
     table = np.pad(table, (pad[1], (0, 0)), mode="edge").T
-    return [np.asarray(x)[:samples, :m] for x in _scan(*padded, table, h)]
+    state, out = _settled(padded[0][0], table), []
+    for begin in range(0, len(padded[0]), _BUCKET):
+        state, moved = _scan(state, *(x[begin : begin + _BUCKET] for x in padded), table, h)
+        out.append(moved)
+    return [np.concatenate(parts)[:samples, :m] for parts in zip(*out, strict=True)]
+
+
+@jax.jit
+def _settled(load: Float[Array, " m"], law: Float[Array, "4 m"]) -> tuple[Array, Array]:
+    """Twist and its speed at rest."""
+    K, _, b, s = law
+    spring = -load / K  # y (1 + s (K y)²) is what it would be without stiffening
+    for _ in range(8):
+        spring = spring - (spring * (1 + s * (K * spring) ** 2) + load / K) / (1 + 3 * s * (K * spring) ** 2)
+    rest = spring - b * jnp.sign(load)
+    return rest, jnp.zeros_like(rest)
 
 
 @jax.jit
 def _scan(
+    state: tuple[Array, Array],
     load: Float[Array, "fine m"],
     inertia: Float[Array, "fine m"],
     slope: Float[Array, "fine m"],
@@ -139,10 +156,4 @@ def _scan(
         x = x + h * new
         return (x, new), (x, new, (new - v) / h)
 
-    spring = -load[0] / K  # settled: y (1 + s (K y)²) is what it would be without stiffening
-    for _ in range(8):
-        spring = spring - (spring * (1 + s * (K * spring) ** 2) + load[0] / K) / (
-            1 + 3 * s * (K * spring) ** 2
-        )
-    rest = spring - b * jnp.sign(load[0])
-    return jax.lax.scan(step, (rest, jnp.zeros_like(rest)), (load, inertia, slope), unroll=8)[1]
+    return jax.lax.scan(step, state, (load, inertia, slope), unroll=8)
