@@ -277,6 +277,22 @@ def test_a_model_whose_own_numbers_are_wrong_is_not_consistent(gain, rub, named,
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("share", [0.2, 0.6])
+def test_a_torque_sensor_that_saturates_is_told_with_its_limit(share):
+    """With less than what gravity takes all the time it had been a gain of none, and an offset."""
+    arm = Arm.panda()
+    load = lambda t, q, qd, qdd: Motion(arm, t, q, qd, qdd, np.zeros_like(q)).load[:, 3]
+    made = [record(0), record(1)]
+    limit = share * max(np.abs(one.tau[:, 3]).max() for one in made)
+    lost = lambda *s: np.eye(7)[3] * (np.clip(load(*s), -limit, limit) - load(*s))[:, None]
+    result = diagnose(None, [record(0, lost), record(1, lost)])
+    assert [(f.effect, f.joints) for f in result.findings] == [("unknown", (3,))], result.lines()
+    numbers = {p["name"]: p for p in result.findings[0].parameters}
+    assert numbers["limit"]["value"] == pytest.approx(limit, abs=3 * numbers["limit"]["std"])
+    assert numbers["share_missed"]["value"] == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.slow
 def test_what_the_healthy_arm_shows_already_is_not_reported():
     def worn(t, q, qd, qdd):
         return np.eye(7)[3] * 0.3

@@ -36,6 +36,7 @@ from jaxpanda.effects.unknown import (
     Unknown,
     UnknownAt,
     UnknownDrag,
+    UnknownLimit,
     UnknownOfSpeeds,
     UnknownOfTwo,
     UnknownSpin,
@@ -89,6 +90,7 @@ def shapes(arm: Arm):
         UnknownDrag(arm.dof, 0.1, (0.1, 0.4)),
         UnknownSpin(arm.dof),
         UnknownAt(2, 0.1, 0.2),
+        UnknownLimit(2, 1.0),
         *(Unknown(2, 2, (-0.4, 0.0, 0.4), form) for form in ("of q", "of q_k", "friction of q")),
     ]
     kinds = {}
@@ -258,6 +260,17 @@ def test_a_torque_sensor_is_as_likely_to_show_half_as_double():
     np.testing.assert_allclose(log_prior(1.0), -0.5 * (np.log(2) / s[0]) ** 2)
     assert log_prior(-0.97) < log_prior(0.97) - 50
     assert np.isfinite(log_prior(-1.2))
+
+
+def test_what_a_saturated_sensor_shows_tells_no_torque_beyond_its_limit():
+    t, tau = jnp.arange(3.0), jnp.array([[1.0], [5.0], [-7.0]])
+    sensor = UnknownLimit(0, 4.0)
+    np.testing.assert_allclose(sensor.sensed(jnp.ones(1), t, tau)[:, 0], [1, 4, -4])
+    np.testing.assert_allclose(
+        sensor.true(jnp.ones(1), t, sensor.sensed(jnp.ones(1), t, tau))[:, 0], [1, 4, -4]
+    )
+    half = jnp.full(1, 0.5)
+    np.testing.assert_allclose(sensor.true(half, t, sensor.sensed(half, t, tau)), tau)
 
 
 def test_a_delay_reproduces_the_shifted_torque_where_it_was_linearised(motion):

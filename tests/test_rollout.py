@@ -32,6 +32,7 @@ from jaxpanda.effects.unknown import (
     Unknown,
     UnknownAt,
     UnknownDrag,
+    UnknownLimit,
     UnknownOfSpeeds,
     UnknownOfTwo,
     UnknownSpin,
@@ -78,6 +79,7 @@ def every_kind(arm: Arm) -> Corrected:
         (Backlash(1, 0.004, 1e4), [0.004]),
         (EncoderOffset(1, 0.02), [0.03]),
         (TorqueOffset(0), [0.4]),
+        (UnknownLimit(1, 0.5), [0.8]),
     )
 
 

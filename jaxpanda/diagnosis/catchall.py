@@ -7,7 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..effects import AbstractJointEffect, Motion
-from ..effects.unknown import FORMS, Unknown, UnknownDrag, UnknownOfSpeeds, UnknownOfTwo, UnknownSpin
+from ..effects.unknown import (
+    FORMS,
+    Unknown,
+    UnknownDrag,
+    UnknownLimit,
+    UnknownOfSpeeds,
+    UnknownOfTwo,
+    UnknownSpin,
+)
 from .host import parallel
 from .library import Candidates, columns_of
 from .traces import Trace
@@ -21,8 +29,10 @@ _SLOW = 1e-3
 _OF_FASTEST, _REACHES = (0.15, 0.4, 0.7, 1.0), (0.0, 0.1, 0.2)
 """Knots of a drag, in the largest speed of the last link, and where beyond its frame it may act [m]."""
 
-Free = Unknown | UnknownOfTwo | UnknownOfSpeeds | UnknownDrag | UnknownSpin
+Free = Unknown | UnknownOfTwo | UnknownOfSpeeds | UnknownDrag | UnknownSpin | UnknownLimit
 
+_LIMITS = np.geomspace(0.1, 0.98, 16)
+"""Of a torque sensor, in the largest torque of its joint."""
 _KINDS = {
     "odd in dq": lambda m, j: np.abs(m.qd[:, j]),
     "even in dq": lambda m, j: np.abs(m.qd[:, j]),
@@ -56,6 +66,10 @@ def build(traces: Sequence[Trace]) -> list[Candidates]:
         largest = float(np.max(np.abs(qd[:, i] * qd[:, k])))
         if largest > _SLOW:
             alike["of dq_i * dq_k", 0] += [UnknownOfSpeeds(j, i, k, largest) for j in range(dof)]
+
+    largest = np.max([np.abs(t.motion.torque).max(0) for t in traces], 0)
+    for j in np.flatnonzero(largest > 0):
+        alike["limit", 0] += [UnknownLimit(int(j), float(share * largest[j])) for share in _LIMITS]
 
     speeds = np.concatenate([_speed_of_last_link(t.motion) for t in traces])
     knots = np.max(speeds) * np.array(_OF_FASTEST)

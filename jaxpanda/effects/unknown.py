@@ -24,6 +24,10 @@ from .motion import Channels, Joint, Motion, wrench_columns
 
 FREE = -21.0
 """Prior of a torque that has no law."""
+LAWFUL = 6.0
+"""What is added to that of a law with no name of its own, so that it is as likely as a named one."""
+_SHOWN = 0.9
+"""Share missed up to which what a sensor shows tells the torque."""
 SIGN_WIDTH = 0.01
 """Velocity over which friction without a law changes sign [rad/s]."""
 FORMS = {
@@ -400,4 +404,52 @@ class UnknownAt(AbstractDryFriction):
         return x, jnp.exp(-0.5 * x * x)
 
 
-EFFECTS = (Unknown, UnknownOfTwo, UnknownOfSpeeds, UnknownDrag, UnknownSpin, UnknownAt)
+class UnknownLimit(AbstractInstantEffect):
+    r"""A torque sensor that saturates: of torque beyond $\pm L$ it misses a share, all of it where that is 1.
+
+    $$\tau_j^{shown} = \tau_j - m\,(\tau_j - \mathrm{clip}(\tau_j, -L, L))$$
+    """
+
+    name: ClassVar[str] = "unknown"
+    seen_against: ClassVar[str] = "model torque"
+    prior: ClassVar[float] = FREE
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("limit", "N·m", 1e-3, 1e6),)
+    reveals: ClassVar[str] = "poses in which the joint bears known loads, small and large"
+    acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
+
+    joint: Joint
+    limit: Float[Array, ""] | float
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["UnknownLimit"]:
+        return []  # the limits are shares of the largest torque in the recordings
+
+    @property
+    def form_prior(self) -> float:
+        return LAWFUL
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("share_missed", "1", sign=1, scale=1.0),)
+
+    @property
+    def equation(self) -> str:
+        beyond = "(tau - clip(tau, -limit, limit))"
+        return f"tau_measured = tau - share_missed * {beyond}: a torque sensor that saturates"
+
+    def at(self, s: Channels) -> Float[Array, " n"]:
+        return -self._beyond(s.torque[self.joint])[None]
+
+    def sensed(self, c, t, tau):
+        return tau.at[:, self.joint].add(-c[0] * self._beyond(tau[:, self.joint]))
+
+    def true(self, c, t, tau):
+        """What is missed altogether is not known."""
+        kept = jnp.where(c[0] < _SHOWN, 1 - c[0], 1.0)
+        return tau.at[:, self.joint].add(self._beyond(tau[:, self.joint]) * (1 / kept - 1))
+
+    def _beyond(self, tau: Array) -> Array:
+        return tau - jnp.clip(tau, -self.limit, self.limit)
+
+
+EFFECTS = (Unknown, UnknownOfTwo, UnknownOfSpeeds, UnknownDrag, UnknownSpin, UnknownAt, UnknownLimit)
