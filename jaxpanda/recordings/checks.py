@@ -28,6 +28,8 @@ _STAYS = 0.1
 """How long it is there then, at least [s]."""
 _APART = 3.0
 """How many times faster than the rows beside it."""
+_EMPTY = 50.0
+"""How many times as many samples as there are rows may be missing from a recording."""
 _TRAVELS = 0.5
 """How far a joint moves that says which unit positions are in [rad]."""
 _FASTEST = 10.0
@@ -48,6 +50,7 @@ def checked(recording: Recording, row: Callable[[int], str] | None = None) -> Re
     """
     row = row or (lambda i: f"row {i + 1}")
     _rate(recording)
+    _on_and_on(recording, row)
     _long_enough(recording)
     _unwrapped(recording, row)
     recording = without_glitches(recording)
@@ -62,8 +65,10 @@ def plausible(recording: Recording) -> Recording:
     Raises:
         InputError: naming what is not, and what would work.
     """
+    row = lambda i: f"row {i + 1}"
     _rate(recording)
-    _unwrapped(recording, lambda i: f"row {i + 1}")
+    _on_and_on(recording, row)
+    _unwrapped(recording, row)
     _units(recording)
     _continuous(recording)
     return recording
@@ -95,6 +100,24 @@ def _rate(recording: Recording) -> None:
     )
 
 
+def _on_and_on(recording: Recording, row: Callable[[int], str]) -> None:
+    """No stamp is so far from the rest that next to nothing of the time was recorded: motions go on a grid."""
+    if recording.samples < 2:
+        return
+    steps = np.diff(recording.time)
+    span = float(recording.time[-1] - recording.time[0])
+    if span < _EMPTY * recording.samples * float(np.median(steps)):
+        return
+    i = int(np.argmax(steps)) + 1
+    before, after = recording.time[i - 1 : i + 1]
+    part = f"--from {after:.10g}" if i < recording.samples / 2 else f"--to {before:.10g}"
+    raise InputError(
+        f"{recording.name}: column time, {row(i)}: time jumps from {before:.10g} s to {after:.10g} s, and of"
+        f" {span:.4g} s no more than {span - steps.max():.4g} s are recorded: read what lies on one side of it"
+        f" ({part}), or mend the stamp"
+    )
+
+
 def _long_enough(recording: Recording) -> None:
     duration = recording.time[-1] - recording.time[0] if recording.samples else 0.0
     if duration < SHORTEST:
@@ -106,13 +129,26 @@ def _long_enough(recording: Recording) -> None:
 
 
 def _unwrapped(recording: Recording, row: Callable[[int], str]) -> None:
-    """No joint turns by a whole turn between two rows."""
-    step, elapsed = np.diff(recording.q, axis=0), np.diff(recording.time)[:, None]
-    jumps = (np.abs(np.abs(step) - _TURN) < _WRAPS) & (np.abs(step) > _LEAPS * elapsed)
-    if jumps.any():
+    """No joint turns by a whole turn between two rows, or over one more that a resampling put in between."""
+    for apart in (1, 2):
+        step = recording.q[apart:] - recording.q[:-apart]
+        elapsed = (recording.time[apart:] - recording.time[:-apart])[:, None]
+        jumps = (np.abs(np.abs(step) - _TURN) < _WRAPS) & (np.abs(step) > _LEAPS * elapsed)
+        if apart == 2 and len(step):  # beside which nothing is fast: in degrees every step may be that wide
+            jumps &= np.abs(step) > 2 * _APART * np.quantile(
+                np.abs(np.diff(recording.q, axis=0)), 0.9, axis=0
+            )
+        if not jumps.any():
+            continue
         j = int(np.argmax(jumps.any(0)))
-        i = int(np.argmax(jumps[:, j])) + 1
-        before, after = recording.q[i - 1, j], recording.q[i, j]
+        i = int(np.argmax(jumps[:, j])) + apart
+        before, after = recording.q[i - apart, j], recording.q[i, j]
+        if apart == 2:
+            raise InputError(
+                f"{recording.name}: column q_{j + 1}, {row(i - 1)}: the angle jumps by a turn ({before:.4g} rad,"
+                f" then {recording.q[i - 1, j]:.4g} and {after:.4g} rad), as where wrapped angles were resampled:"
+                " unwrap them before that, as numpy.unwrap(q, axis=0) does"
+            )
         raise InputError(
             f"{recording.name}: column q_{j + 1}, {row(i)}: the angle jumps by a turn ({before:.4g} rad, then "
             f"{after:.4g} rad; {int(jumps.sum())} such jumps in all), where positions must be continuous: unwrap "
@@ -137,12 +173,20 @@ def _continuous(recording: Recording) -> None:
         beside = np.max([wide[k : k + len(speed)] for k in (0, 1, 3, 4)], 0)
         alone = (np.abs(step) > _RESETS) & (speed > _FASTEST) & (speed > _APART * beside)
         for i, size in zip(at[alone], step[alone], strict=True):
-            if np.all((q[i : i + stays] - q[i - 1]) / size > 0.5):
+            if not np.all((q[i : i + stays] - q[i - 1]) / size > 0.5):
+                continue
+            if min(i, len(q) - i) < stays:
+                where = ("beginning", "--from", i) if i < stays else ("end", "--to", i - 1)
                 raise InputError(
-                    f"{recording.name}: column q_{j + 1} jumps from {q[i - 1]:.4g} rad to {q[i]:.4g} rad at "
-                    f"{recording.time[i]:.6g} s and stays there, as where an encoder is reset while the log runs "
-                    "on, where positions must be continuous: read one side of it (--to, --from), or record again"
+                    f"{recording.name}: column q_{j + 1} jumps from {q[i - 1]:.4g} rad to {q[i]:.4g} rad at"
+                    f" {recording.time[i]:.6g} s, its {where[0]}: leave those rows out"
+                    f" ({where[1]} {recording.time[where[2]]:.10g})"
                 )
+            raise InputError(
+                f"{recording.name}: column q_{j + 1} jumps from {q[i - 1]:.4g} rad to {q[i]:.4g} rad at "
+                f"{recording.time[i]:.6g} s and stays there, as where an encoder is reset while the log runs "
+                "on, where positions must be continuous: read one side of it (--to, --from), or record again"
+            )
 
 
 def _radians(recording: Recording) -> None:
@@ -191,6 +235,7 @@ def _velocity_unit(recording: Recording) -> None:
     for factor, cure in (
         (180 / np.pi, "dq looks like degrees per second: multiply it by pi/180"),
         (np.pi / 180, "q looks like degrees beside dq in rad/s: multiply q by pi/180"),
+        (30 / np.pi, "dq looks like revolutions per minute: multiply it by pi/30"),
         (1e3, "dq is a thousand times d(q)/dt: check the units of time and dq"),
         (1e-3, "dq is a thousandth of d(q)/dt: check the units of time and dq"),
     ):

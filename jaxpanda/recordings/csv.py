@@ -4,6 +4,7 @@
 """
 
 import gzip
+import re
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ def read_csv(path: Path, reading: Reading) -> list[Recording]:
     filled = [first + 1 + i for i, line in enumerate(body) if line.strip()]
 
     def take(places) -> np.ndarray:
-        return numbers(body, path.name, delimiter, names, first + 1)[:, list(places)]
+        return numbers(body, path.name, delimiter, names, first + 1, places)
 
     def row(i: int) -> str:
         return f"row {i + 1} (line {filled[i]})"
@@ -60,11 +61,16 @@ def read_csv(path: Path, reading: Reading) -> list[Recording]:
 
 
 def _header(lines: list[str]) -> int:
-    """The first line that is not blank nor a comment; numbers may follow the last comment, which is it then."""
-    filled = [i for i, line in enumerate(lines) if line.strip()]
+    """The first line that is not blank, a comment nor a spreadsheet's `sep=;`; the last comment, where a row that
+    begins with a number follows."""
+    filled = [i for i, line in enumerate(lines) if line.strip() and not re.fullmatch(r"sep=.", line.strip())]
     plain = next((i for i in filled if lines[i].lstrip()[0] not in "#%"), filled[-1])
     comments = [i for i in filled if i < plain]
-    return comments[-1] if comments and _are_numbers(_cells(lines[plain])[0]) else plain
+    if not comments:
+        return plain
+    row, header = _cells(lines[plain])[0], _cells(lines[comments[-1]])[0]
+    follows = len(row) == len(header) > 1 and _is_number(row[0]) and not _is_number(header[0])
+    return comments[-1] if follows or _are_numbers(row) else plain
 
 
 def _cells(line: str) -> tuple[list[str], str | None]:

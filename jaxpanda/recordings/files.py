@@ -127,9 +127,10 @@ def content_of(recording: Recording, path: str | Path) -> bytes:
         InputError: unknown suffix, or a folder that does not exist.
     """
     path = Path(path)
-    writer = _WRITERS.get(_by_suffix(path))
+    kind = next((kind for suffix, kind in _SUFFIXES.items() if path.name.lower().endswith(suffix)), "")
+    writer = _WRITERS.get(kind)
     if writer is None or path.name.lower().removesuffix(".gz").endswith(_TEXT[1:]):
-        raise InputError(f"{path.name}: recordings are written as .csv, .csv.gz, .npz or .parquet")
+        raise InputError(f"{path}: recordings are written as .csv, .csv.gz, .npz or .parquet")
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist")
     return writer(recording, path.name)

@@ -58,21 +58,36 @@ def _source(features: dict[str, dict[str, Any]], version: str) -> Source:
     """What the names of the data set's features say of their columns."""
     columns = {"time": "timestamp"}
     state = _names(features.get(_STATE, {}))
+    positions: list[int] = []
     for channel, suffixes in _SUFFIXES.items():
-        places = [
-            k for k, name in enumerate(state) if not _GRIPPER.search(name) and _is_joint(name, suffixes)
-        ]
+        places = _in_order(
+            {
+                k: name
+                for k, name in enumerate(state)
+                if not _GRIPPER.search(name) and _is_joint(name, suffixes)
+            }
+        )
+        positions = places if channel == "q" else positions
         if places:
             columns[channel] = ",".join(f"{_STATE}[{k}]" for k in places)
     for channel, words in (("dq", ("velocity",)), ("tau", ("torque", "effort"))):
         named = [f for f in features if f.startswith("observation.") and f != _STATE and f.endswith(words)]
         if channel not in columns and len(named) == 1:
-            joints = [k for k, name in enumerate(_names(features[named[0]])) if not _GRIPPER.search(name)]
+            given = _names(features[named[0]])
+            joints = _in_order({k: name for k, name in enumerate(given) if not _GRIPPER.search(name)})
+            joints = joints if given else positions  # in the order of what has names
             columns[channel] = ",".join(f"{named[0]}[{k}]" for k in joints) or named[0]
     columns.setdefault("q", "observation.joint_positions")
     return Source(
         f"a LeRobot data set ({version})", columns, "unstated", WORDS["unstated"], episode="episode_index"
     )
+
+
+def _in_order(names: dict[int, str]) -> list[int]:
+    """Places of joints in the order of their numbers, where one name numbers them all; else as they come."""
+    numbers = {k: re.findall(r"\d+", name) for k, name in names.items()}
+    one = len({re.sub(r"\d+(?!.*\d)", "", name) for name in names.values()}) == 1
+    return sorted(names, key=lambda k: int(numbers[k][-1])) if one and all(numbers.values()) else list(names)
 
 
 def _names(feature: dict[str, Any]) -> list[str]:

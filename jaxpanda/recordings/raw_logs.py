@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..reading import Reading
 from .checks import checked
 from .recording import Origin, Recording
-from .table import chosen, cut, refuse
+from .table import chosen, cut, factor_of, refuse, split_unit
 from .text import numbers, read_text
 from .ticks import Ticks, consistent, reconstruct
 
@@ -57,7 +57,8 @@ def read_raw_logs(path: Path, reading: Reading) -> list[Recording]:
         InputError: naming the folder or file and the row, and what would work.
     """
     refuse(path.name, reading, "topic")
-    files = find_logs(path, reading.channels())
+    said = reading.channels()
+    files = find_logs(path, said)
     time = _numbers(files["time"], "time")
     if time.shape[1] != 1:
         raise InputError(f"{files['time'].name}: {time.shape[1]} numbers a line, where time has one")
@@ -66,8 +67,8 @@ def read_raw_logs(path: Path, reading: Reading) -> list[Recording]:
         for channel, file in files.items()
     }
     rows = min(map(len, logs.values()))
-    short = sum(len(log) - rows for log in logs.values())
-    logs = {channel: log[:rows] for channel, log in logs.items()}
+    short = max(len(log) for log in logs.values()) - rows
+    logs = {channel: _in_si(channel, log[:rows], said, path) for channel, log in logs.items()}
     _same_joints(logs, files)
     stamps = logs["time"][:, 0]
     breaks = [0, *(np.flatnonzero(np.diff(stamps) < 0) + 1).tolist(), rows]
@@ -106,9 +107,10 @@ def find_logs(path: Path, columns: Mapping[str, str] | None = None) -> dict[str,
         if not name:
             found[channel] = []
             continue
-        if not (path / name).is_file():
+        file = path / name if (path / name).is_file() else path / split_unit(name)[0]
+        if not file.is_file():
             raise InputError(f"{path}: no file {name!r} (asked for as {channel}) in this folder")
-        found[channel] = [path / name]
+        found[channel] = [file]
     for channel in ("time", "q"):
         if not found[channel]:
             what = "time stamps" if channel == "time" else "joint positions"
@@ -135,6 +137,15 @@ def find_logs(path: Path, columns: Mapping[str, str] | None = None) -> dict[str,
         if likely:
             chosen[channel] = likely[0]
     return chosen
+
+
+def _in_si(
+    channel: str, log: Float[np.ndarray, "row column"], said: Mapping[str, str], path: Path
+) -> Float[np.ndarray, "row column"]:
+    """A log whose unit was said with its file, in SI."""
+    where = said.get(channel, "")
+    factor = 1.0 if not where or (path / where).is_file() else factor_of(channel, where)
+    return log if factor == 1 else factor * log
 
 
 def _tokens(file: Path) -> list[str]:

@@ -60,6 +60,8 @@ _JOINT_STATES = {
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _CHANNELS = {"q": "position", "dq": "velocity", "tau": "effort"}
 _GRIPPER = re.compile(r"finger|gripper|robotiq|knuckle|hand_|jaw", re.IGNORECASE)
+_FEW = 8
+"""Joints that a message lists."""
 _LOOK = 200
 """Messages of a topic that are looked at for the joints they name."""
 
@@ -91,7 +93,7 @@ def read_bag(path: Path, reading: Reading) -> list[Recording]:
             return _take(bag, topic, path.name, [list(columns)[i] for i in places], columns, taken)
 
         notes = (f"topic {topic} ({_short(kind)})",)
-        if not _has_stamp(samples[0][1]):
+        if not any(_has_stamp(message) for _, message in samples):
             notes += ("its messages have no stamps: time is when they were received",)
         table = Table(
             path, path.name, list(columns), take, lambda i: f"message {i + 1}", notes, lambda: taken
@@ -130,11 +132,21 @@ def _topic(path: Path, bag: Any, reading: Reading) -> tuple[str, str]:
         return asked, kinds[asked]
     states = {name: kind for name, kind in kinds.items() if kind in _STATES or kind in _JOINT_STATES}
     arms = {name: kind for name, kind in states.items() if kind != _JOINT_STATE or _arms(_joints(bag, name))}
+    if not arms and "q" in reading.channels():
+        arms = states
     if len(arms) == 1:
         return next(iter(arms.items()))
     if arms:
         raise InputError(
             f"{path.name}: {len(arms)} topics could be meant, {_listed(arms)}: choose by --topic"
+        )
+    if states:
+        topic = next(iter(states))
+        names = _joints(bag, topic)
+        shown = ", ".join(map(printable, names[:_FEW])) + ", …" * (len(names) > _FEW) or "none"
+        raise InputError(
+            f"{path.name}: the joints of topic {printable(topic)} ({shown}) have no names that tell their"
+            " order: say it by --columns, as q=position.FIRST,position.SECOND,…"
         )
     known = ", ".join(_short(kind) for kind in (*_JOINT_STATES, *_STATES))
     raise InputError(
@@ -219,13 +231,14 @@ def _take(
     rows: list[list[float]] = []
     stamps: list[int] = []
     first: dict[str, int] = {}
-    stamped = None
-    other = repeated = 0
+    stamped = any(_has_stamp(message) for _, message in _samples(bag, topic))
+    read = other = repeated = 0
     for received, message in _messages(bag, topic):
         stamp = _stamp(message)
-        if stamped is None:
-            stamped = stamp is not None
-        if stamped and stamp is None:
+        if stamped and stamp is None and not read:
+            stamp = 0  # of a simulation's beginning, or of a row that was not filled in: `checked` knows
+        read += 1
+        if stamped != (stamp is not None):
             raise InputError(
                 f"{name}: topic {topic}: some messages have a stamp and some have none; say "
                 "--columns time=received"
@@ -248,6 +261,12 @@ def _take(
         else:
             rows.append(row)
             stamps.append(now)
+    if not rows and other:
+        lacking = " … ".join(map(printable, (wanted[1], wanted[-1])))
+        raise InputError(
+            f"{name}: topic {topic}: none of its {other} messages holds all of {lacking}: joints that come in"
+            " several messages are not put together"
+        )
     taken.update({what: count for what, count in {_OTHER: other, _REPEATED: repeated}.items() if count})
     return np.array(rows, dtype=float).reshape(-1, len(wanted))
 
@@ -291,7 +310,10 @@ def _joint_sources(
         return ()
     if len(arms) > 1 and not asked:
         choices = ", ".join(f"--columns q={start}{arm}" for arm in arms)
-        raise InputError(f"{name}: topic {topic} holds the joints of {len(arms)} arms: choose by {choices}")
+        raise InputError(
+            f"{name}: topic {topic} holds the joints of {len(arms)} arms: choose by {choices}; if they are one"
+            " arm's, name them from the base on, as q=position.FIRST,position.SECOND,…"
+        )
     chain = next(iter(arms.values()))
     mapped = {c: ",".join(f"{prefix}{field}.{joint}" for joint in chain) for c, field in _CHANNELS.items()}
     return (_declared(kind, chain, {"time": "stamp", **mapped}),)
@@ -302,7 +324,7 @@ def _declared(kind: str, joints: Sequence[str], columns: dict[str, str]) -> Sour
     torque: Torque = "unstated"
     if kind != _JOINT_STATE or any(re.search(r"(panda|fr3|fer)\w*_joint\d$", joint) for joint in joints):
         torque, says = "measured", f"effort is libfranka's tau_J, the {MEASURED}"
-    elif any(joint.endswith(ur.JOINTS[0]) for joint in joints):
+    elif all(any(joint.endswith(name) for joint in joints) for name in ur.JOINTS):
         says = ur.EFFORT
     else:
         says = "what effort is depends on the robot's driver: nothing here says it"

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from .. import inputs
 from ..errors import InputError
 from ..reading import CHANNELS, Reading
-from .checks import SHORTEST, checked
+from .checks import RATES, SHORTEST, checked
 from .recording import Origin, Recording, Torque
 
 UNITS: Mapping[str, Mapping[str, float]] = {
@@ -95,6 +95,7 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
     mapping: dict[str, str] = {}
     for name, where in wanted.items():
         mapping |= _mapping(table, name, where)
+    _stated_units(table, said, mapping)
     found = find_channels(table.names, table.name, mapping)
     found = {name: places for name, places in found.items() if wanted.get(name) != ""}
     nanoseconds = _second_part(table.names, wanted.get("time", ""))
@@ -102,17 +103,21 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
     content = dict(zip(places, np.asarray(table.take(places), dtype=float).T, strict=True))
     channels: dict[str, np.ndarray] = {}
     for name, group in found.items():
-        factor = _factor(name, wanted.get(name, ""), table.names)
         values = np.column_stack([content[place] for place in group])
-        channels[name] = values if factor == 1 else factor * values
+        factors = [_factor(name, j, wanted, table.names) for j in range(1, len(group) + 1)]
+        channels[name] = values if set(factors) == {1.0} else values * factors
     time = channels["time"][:, 0]
     if nanoseconds and len(time):  # from the first whole second on, so that no digit is lost
         time = time - np.floor(time[0]) + 1e-9 * content[nanoseconds[0]]
-    absent = [name for name in MEASURED_TOO if name in there and np.all(np.isnan(channels[name]))]
+    absent = {
+        name: what
+        for name in MEASURED_TOO
+        if name in channels
+        and name not in said
+        and (what := unmeasured(channels[name], channels["q"], name in there))
+    }
     channels = {name: values for name, values in channels.items() if name not in absent}
-    notes = [
-        f"{name} is nan throughout, as drivers write what they do not measure: left out" for name in absent
-    ]
+    notes = [UNMEASURED.format(name=name, what=what) for name, what in absent.items()]
     if ignored := [name or "(no name)" for i, name in enumerate(table.names) if i not in content]:
         notes.append(f"ignores {len(ignored)} other columns: {_listed(_stems(ignored))}")
     torque, says = _torque(source, said)
@@ -121,6 +126,7 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
     taken = {
         name: _span([table.names[place] for place in found[name]]) for name in CHANNELS if name in channels
     }
+    _seconds(table, source, time, declared.get("time", "") if "time" not in said else "")
     rows, cut_notes = within(table.name, time, reading)
     row = lambda i: table.row(i + rows.start)
     recording = Recording(
@@ -137,6 +143,14 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
         row=row,
     )
     return checked(recording, row)
+
+
+def unmeasured(values: Float[np.ndarray, "rows n"], q: Float[np.ndarray, "rows n"], declared: bool) -> str:
+    """What stands in the place of a channel that was not measured; empty where it was, or where it is nan and its
+    source is not `declared`."""
+    if declared and np.all(np.isnan(values)):
+        return "nan"
+    return "0" if not np.any(values) and len(q) and np.any(np.ptp(q, axis=0) > 0) else ""
 
 
 def _named(source: Source | None, said: Mapping[str, str]) -> str:
@@ -250,6 +264,8 @@ def of_arrays(
 
 WIDEST = 1000
 """Columns that one array may have."""
+UNMEASURED = "{name} is {what} throughout, as drivers and simulators write what they do not measure: left out"
+"""What is told of such a channel."""
 MEASURED_TOO = CHANNELS[2:]
 """What may stand beside positions."""
 COLUMNS = 5000
@@ -258,17 +274,20 @@ COLUMNS = 5000
 
 def _source(table: Table, sources: Sequence[Source], said: Mapping[str, str]) -> Source | None:
     """The first source that this table is from; None where it is canonical or the user says it all."""
+    needed = [c for c in ("time", "q") if c not in said] or ["time", "q"]
     for source in sources:
-        needed = [source.columns.get("time", ""), source.columns.get("q", ""), *source.marks]
-        if all(_there(table.names, where) for where in needed):
+        marks = [*(source.columns.get(c, "") for c in needed), *source.marks]
+        if all(_there(table.names, where) for where in marks):
             return source
     seen = {name.lower() for name in table.names}
-    if {"time", "q_1"} <= seen or {"time", "q"} <= said.keys() or "q_1" in said:
+    timed = "time" in seen or "time" in said
+    if timed and ("q_1" in seen or "q" in said or "q_1" in said):
         return None
     if "time" in seen and any(_known(name) for name in seen - {"time"}):
         return None  # all but canonical: `find_channels` says what is wrong
-    what = "no columns q_1, q_2, …" if "time" in seen or "time" in said else "no column time"
-    likely = _proposal(table.names)
+    timed = timed or any(_there(table.names, s.columns["time"]) for s in sources if s.columns.get("time"))
+    what = "no columns q_1, q_2, …" if timed else "no column time"
+    likely = _proposal(table.names, said)
     raise InputError(
         f"{table.name}: {what}; it has {listed(table.names)}, where time, q_1, …, dq_1, …, tau_1, … are needed: "
         + (
@@ -281,7 +300,7 @@ def _source(table: Table, sources: Sequence[Source], said: Mapping[str, str]) ->
 
 def listed(names: Sequence[str]) -> str:
     """The columns of a table, joints put together, for a message."""
-    return f"the columns {_listed(_stems(names))}"
+    return f"the columns {_listed(_stems(names))}" if any(names) else "no columns of numbers"
 
 
 def _stems(names: Sequence[str]) -> list[str]:
@@ -319,13 +338,58 @@ _COMMANDS = {
 }
 
 
-def _proposal(names: Sequence[str]) -> str:
-    """The option that would say which column is which, where names look like it; else nothing."""
+_STATED = re.compile(r"[\[(\s_]\s*(deg|degrees|°|ms|us|µs|ns)\s*(/\s*s|ps)?\s*[\])]?$", re.IGNORECASE)
+"""A unit that is not SI's at the end of a column's name, and whether it is one of a velocity."""
+
+
+def _stated(channel: str, name: str) -> str:
+    """The unit, not SI's, that a column's name gives; empty where it gives none that the channel has."""
+    if (m := _STATED.search(name)) is None:
+        return ""
+    unit = {"degrees": "deg", "°": "deg", "µs": "us"}.get(m[1].lower(), m[1].lower()) + ("/s" if m[2] else "")
+    return unit if unit in UNITS.get(channel, {}) else ""
+
+
+def _stated_units(table: Table, said: Mapping[str, str], mapping: Mapping[str, str]) -> None:
+    """Refuse what the user says of a column whose name gives another unit than what is said."""
+    for channel, where in said.items():
+        stem, _, joint = channel.rpartition("_")
+        base = stem if joint.isdecimal() else channel
+        name = mapping.get(channel, mapping.get(f"{channel}_1", ""))
+        unit = _stated(base, name)
+        if unit and (where in table.names or not split_unit(where)[1]):
+            si = next(iter(UNITS[base]))
+            raise InputError(
+                f"--columns {channel}={where}: {table.name} calls it {name!r}, which is read in {si}: say"
+                f" {channel}={where}:{unit}, or :{si} if it is not in {unit}"
+            )
+
+
+def _seconds(table: Table, source: Source | None, time: Float[np.ndarray, " rows"], where: str) -> None:
+    """Refuse times in seconds that are read as the source writes them, in another unit."""
+    unit = split_unit(where)[1]
+    factor = UNITS["time"].get(unit, 1.0)
+    if source is None or factor == 1 or len(time) < 2 or not np.isfinite(time).all():
+        return
+    step = float(np.median(np.diff(time))) / factor
+    if 1 / RATES[1] <= step <= 1 / RATES[0]:
+        raise InputError(
+            f"{table.name}: column time is read in {unit}, as {source.name} writes it, and looks like seconds"
+            f" (its median step is {step:g}): say so by --columns time={where.removesuffix(f':{unit}')}:s"
+        )
+
+
+def _proposal(names: Sequence[str], told: Mapping[str, str]) -> str:
+    """The option that would say which column is which, where names look like it, what is told already included;
+    else nothing."""
     stems: dict[str, None] = {}
     for name in names:
         stems.setdefault(re.sub(r"\d+(?!.*\d)", "{j}", name))
     said = []
     for channel, like in _LIKE.items():
+        if channel in told:
+            said.append(f"{channel}={told[channel]}")
+            continue
         fits = []
         for stem in stems:
             words = set(
@@ -338,26 +402,44 @@ def _proposal(names: Sequence[str]) -> str:
             ):
                 fits.append(stem)
         if fits:
-            said.append(f"{channel}={min(fits, key=len)}")
+            best = min(fits, key=len)
+            unit = _stated(channel, best)
+            said.append(f"{channel}={best}" + (f":{unit}" if unit else ""))
         elif channel in ("time", "q"):
             return ""
     return " ".join(f"'{one}'" if " " in one or ("{" in one and "[" in one) else one for one in said)
 
 
 def _there(names: Sequence[str], where: str) -> bool:
-    return where == "" or bool(_expand(names, _split_unit(where)[0]))
+    return where == "" or bool(_expand(names, split_unit(where)[0]))
 
 
-def _split_unit(where: str) -> tuple[str, str]:
+def factor_of(channel: str, where: str) -> float:
+    """What a channel's numbers are multiplied by to be in SI, by the unit said behind its columns.
+
+    Raises:
+        InputError: it is no unit of such a channel.
+    """
+    unit = split_unit(where)[1]
+    stem, _, joint = channel.rpartition("_")
+    base = stem if joint.isdecimal() else channel
+    if unit and unit not in UNITS.get(base, {}):
+        has = ", ".join(UNITS[base]) if base in UNITS else "none here; torque's is said by --torque-unit"
+        raise InputError(f"--columns {channel}={where}: {unit} is no unit of {base}; its units are {has}")
+    return UNITS[base][unit] if unit else 1.0
+
+
+def split_unit(where: str) -> tuple[str, str]:
     """What names the columns, and the unit after the last colon if there is one."""
     head, colon, unit = where.rpartition(":")
     known = {unit for units in UNITS.values() for unit in units}
     return (head, unit) if colon and unit in known else (where, "")
 
 
-def _factor(channel: str, where: str, names: Sequence[str]) -> float:
-    unit = "" if where in names else _split_unit(where)[1]
-    return UNITS[channel][unit] if unit else 1.0
+def _factor(channel: str, joint: int, wanted: Mapping[str, str], names: Sequence[str]) -> float:
+    of_joint = f"{channel}_{joint}"
+    where = wanted.get(of_joint, wanted.get(channel, ""))
+    return 1.0 if where in names else factor_of(of_joint if of_joint in wanted else channel, where)
 
 
 def _second_part(names: Sequence[str], where: str) -> list[int]:
@@ -398,12 +480,11 @@ def _mapping(table: Table, channel: str, where: str) -> dict[str, str]:
         if channel in ("time", "q"):
             raise InputError(f"--columns {channel}=: {channel} cannot be left out")
         return {}
-    plain, unit = (where, "") if where in table.names else _split_unit(where)
-    stem, _, joint = channel.rpartition("_")
-    base = stem if joint.isdecimal() else channel
-    if unit and unit not in UNITS.get(base, {}):
-        has = ", ".join(UNITS[base]) if base in UNITS else "none here; torque's is said by --torque-unit"
-        raise InputError(f"--columns {channel}={where}: {unit} is no unit of {base}; its units are {has}")
+    plain = where
+    if where not in table.names:
+        factor_of(channel, where)
+        plain = split_unit(where)[0]
+    joint = channel.rpartition("_")[2]
     columns = _expand(table.names, plain)
     if not columns:
         raise InputError(

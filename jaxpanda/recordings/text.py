@@ -1,5 +1,6 @@
 """Bytes of a text file, plain or gzipped, into numbers, with the place of whatever is none."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,14 @@ def read_text(path: Path) -> str:
 
 
 def numbers(
-    lines: list[str], name: str, delimiter: str | None, columns: list[str], first_line: int
+    lines: list[str],
+    name: str,
+    delimiter: str | None,
+    columns: list[str],
+    first_line: int,
+    places: Sequence[int] | None = None,
 ) -> Float[np.ndarray, "row column"]:
-    """A table of numbers; every line has as many cells as `columns` has names.
+    """Columns of a table of numbers; every line has as many cells as `columns` has names.
 
     Args:
         lines: the data lines, without a header; blank lines are skipped.
@@ -29,20 +35,27 @@ def numbers(
         delimiter: between cells; None for blanks and tabs.
         columns: the columns' names, for messages.
         first_line: number of `lines[0]` in the file, 1-based.
+        places: of the columns wanted; what stands in the others need be no number. None for all.
 
     Raises:
         InputError: naming the first ragged line or the first cell that is no number.
     """
+    wanted = list(range(len(columns)) if places is None else places)
     try:
         table = np.loadtxt(lines, dtype=float, delimiter=delimiter, comments=None, ndmin=2)
     except ValueError:
         table = None
     if table is not None and table.shape[1] == len(columns):
-        return table
-    raise InputError(f"{name}: {_first_fault(lines, delimiter, columns, first_line)}")
+        return table[:, wanted]
+    if fault := _first_fault(lines, delimiter, columns, first_line, set(wanted)):
+        raise InputError(f"{name}: {fault}")
+    return np.loadtxt(lines, dtype=float, delimiter=delimiter, comments=None, ndmin=2, usecols=wanted)
 
 
-def _first_fault(lines: list[str], delimiter: str | None, columns: list[str], first_line: int) -> str:
+def _first_fault(
+    lines: list[str], delimiter: str | None, columns: list[str], first_line: int, wanted: set[int]
+) -> str:
+    """What keeps the columns wanted from being numbers; empty where nothing does."""
     row = 0
     for number, line in enumerate(lines, first_line):
         if not line.strip():
@@ -59,10 +72,12 @@ def _first_fault(lines: list[str], delimiter: str | None, columns: list[str], fi
                 f"{len(columns)} ({columns[0]} ... {columns[-1]}): every row must have as many cells as "
                 "there are columns"
             )
-        for column, cell in zip(columns, cells, strict=True):
+        for place, (column, cell) in enumerate(zip(columns, cells, strict=True)):
+            if place not in wanted:
+                continue
             try:
                 float(cell)
             except ValueError:
                 what = f"{cell.strip()[:40]!r} is no number" if cell.strip() else "the cell is empty"
                 return f"column {column}, {where}: {what}; every cell must hold one, with a decimal point"
-    return "the rows cannot be read as numbers"
+    return ""

@@ -1,5 +1,6 @@
 """Parquet, LeRobot, HDF5 and MATLAB files, each written by the library of the format."""
 
+import dataclasses
 import json
 import sys
 
@@ -85,9 +86,21 @@ def test_lerobot_s_joints_are_told_by_their_names(tmp_path, version):
     assert read.origin.torque == "unstated"
 
 
+def test_lerobot_s_joints_come_in_the_order_of_their_numbers(tmp_path):
+    order = [0, 2, 1, 3, 6, 5, 4]
+    written = made()
+    shuffled = dataclasses.replace(written, q=written.q[:, order], tau=written.tau[:, order])
+    lerobot(tmp_path / "set", "v3.0", [shuffled], [f"joint_{j + 1}" for j in order] + ["gripper"])
+    read = load(tmp_path / "set")
+    assert np.array_equal(read.q, written.q.astype(np.float32))
+    assert np.array_equal(read.require_tau(), written.tau.astype(np.float32))
+
+
 def test_lerobot_without_names_asks_which_is_which(tmp_path):
     lerobot(tmp_path / "set", "v3.0", [made()], None)
-    with pytest.raises(InputError, match=r"no column time; it has the columns observation\.state\[\{j\}\]"):
+    with pytest.raises(
+        InputError, match=r"no columns q_1, q_2, …; it has the columns observation\.state\[\{j\}\]"
+    ):
         load(tmp_path / "set")
     read = load(tmp_path / "set", reading=Reading(("time=timestamp", "q=observation.state[0:7]")))
     assert np.array_equal(read.q, made().q.astype(np.float32))

@@ -18,6 +18,7 @@ from jaxpanda.errors import InputError, MissingExtraError
 from jaxpanda.recordings import Reading, Recording, load
 
 EPOCH = 1_700_000_000
+CHANNELS = {"q": "position", "dq": "velocity", "tau": "effort"}
 FRANKA = [f"panda_joint{j}" for j in range(1, 8)]
 UR = [
     "shoulder_pan_joint",
@@ -206,6 +207,46 @@ def test_what_a_driver_does_not_measure_is_left_out_and_told(tmp_path):
         assert any("tau is nan throughout" in note for note in read.notes) == (topic == "/nan")
         with pytest.raises(InputError, match=r"not a motion$"):
             read.require_tau()
+
+
+def test_a_first_message_without_a_stamp_is_the_beginning_of_a_simulation_or_refused(tmp_path):
+    written = made()
+    for folder, epoch in (("simulated", 0), ("real", EPOCH)):
+        (tmp_path / folder).mkdir()
+        with bag(tmp_path / folder, "mcap") as b:
+            for k, t in enumerate(written.time):
+                message = b.joint_state(t, FRANKA, written.q[k], written.qd[k], written.tau[k])
+                message.header.stamp.sec += (epoch if k else 0) - EPOCH
+                b.write("/joint_states", t, message)
+    assert_same(load(tmp_path / "simulated" / "log"), written)
+    with pytest.raises(InputError, match=r"message 2: time jumps from 0 s to 17\d+ s"):
+        load(tmp_path / "real" / "log")
+
+
+def test_joints_of_no_known_order_and_joints_in_several_messages_are_told(tmp_path):
+    written = made(dof=3)
+    names = ["shoulder_pan_joint", "elbow_flex_joint", "wrist_roll_joint"]
+    with bag(tmp_path, "mcap") as b:
+        joint_states(b, names, written)
+    with pytest.raises(
+        InputError, match=r"shoulder_pan_joint, elbow_flex_joint, wrist_roll_joint.*no names that"
+    ):
+        load(b.path)
+    asked = {c: ",".join(f"{field}.{name}" for name in names) for c, field in CHANNELS.items()}
+    read = load(b.path, columns={"q": asked["q"]})
+    assert np.array_equal(read.q, written.q)
+    assert read.origin is not None
+    assert "current" not in read.origin.says
+    (tmp_path / "apart").mkdir()
+    with bag(tmp_path / "apart", "mcap") as b:
+        for k, t in enumerate(written.time):
+            for j in range(3):
+                one = b.joint_state(
+                    t, [f"joint_{j}"], *(x[k, [j]] for x in (written.q, written.qd, written.tau))
+                )
+                b.write("/joint_states", t, one)
+    with pytest.raises(InputError, match="joints that come in several messages are not put together"):
+        load(b.path)
 
 
 def test_messages_without_stamps_take_the_time_they_were_received(tmp_path):

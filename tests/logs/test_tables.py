@@ -170,6 +170,141 @@ def test_from_and_to_cut_by_the_recording_s_time_and_before_it_is_checked(tmp_pa
         Reading(from_=2.0, to=1.0)
 
 
+def canonical(r: Recording, **changed) -> dict[str, np.ndarray]:
+    columns = {"time": r.time} | numbered("q_{j}", r.q, 1) | numbered("dq_{j}", r.qd, 1)
+    return columns | numbered("tau_{j}", r.tau, 1) | changed
+
+
+def test_what_is_not_said_is_taken_as_ever(tmp_path):
+    r = made()
+    columns = {
+        ("t" if name == "time" else name): 1e3 ** (name == "time") * x for name, x in canonical(r).items()
+    }
+    (tmp_path / "log.csv").write_text(table(columns))
+    np.savez(tmp_path / "log.npz", stamp=1e3 * r.time, q=r.q, qd=r.qd, tau=r.tau)
+    for name, time in (("log.csv", "t:ms"), ("log.npz", "stamp:ms")):
+        assert_same(load(tmp_path / name, columns={"time": time}), r)
+
+
+def test_a_joint_s_column_has_a_unit_of_its_own(tmp_path):
+    r = made()
+    columns = canonical(r) | {"q_1": np.rad2deg(r.q[:, 0])}
+    (tmp_path / "log.csv").write_text(table(columns))
+    assert_same(load(tmp_path / "log.csv", columns={"q_1": "q_1:deg"}), r, atol=1e-15)
+
+
+def test_text_in_a_column_that_is_not_taken_is_no_matter_and_one_that_is_names_its_row(tmp_path):
+    r, lines = made(), table(canonical(made())).splitlines()
+    (tmp_path / "log.csv").write_text("\n".join([lines[0] + ",mode", *(line + ",RUN" for line in lines[1:])]))
+    read = load(tmp_path / "log.csv")
+    assert_same(read, r)
+    assert any("mode" in note for note in read.notes)
+    lines[5] = "x" + lines[5]
+    (tmp_path / "log.csv").write_text("\n".join([lines[0] + ",mode", *(line + ",RUN" for line in lines[1:])]))
+    with pytest.raises(InputError, match=r"column time, row 5 \(line 6\)"):
+        load(tmp_path / "log.csv")
+
+
+def test_rostopic_s_header_is_a_comment_above_rows_with_text(tmp_path):
+    r = made()
+    columns = {"time": np.round(1e9 * r.time)} | numbered("field.position{j}", r.q)
+    lines = table(columns, comment="%").splitlines()
+    named = [lines[0] + ",field.name0", *(line + ",joint_1" for line in lines[1:])]
+    (tmp_path / "log.csv").write_text("\n".join(named))
+    with pytest.raises(InputError, match=r"perhaps --columns time=time q=field.position\{j\}"):
+        load(tmp_path / "log.csv")
+    read = load(tmp_path / "log.csv", columns={"time": "time:ns", "q": "field.position{j}"})
+    np.testing.assert_allclose(read.q, r.q)
+
+
+def test_a_spreadsheet_s_first_line_is_no_header(tmp_path):
+    (tmp_path / "log.csv").write_text("sep=;\n" + table(canonical(made()), ";"))
+    assert_same(load(tmp_path / "log.csv"), made())
+
+
+def test_a_unit_in_a_column_s_name_is_proposed_and_not_read_past(tmp_path):
+    r = made()
+    columns = {"time [ms]": 1e3 * r.time} | numbered("q_{j} [deg]", np.rad2deg(r.q), 1)
+    (tmp_path / "log.csv").write_text(table(columns))
+    with pytest.raises(InputError, match=r"'time=time \[ms\]:ms' 'q=q_\{j\} \[deg\]:deg'"):
+        load(tmp_path / "log.csv")
+    with pytest.raises(InputError, match=r"say q=q_\{j\} \[deg\]:deg, or :rad if it is not in deg"):
+        load(tmp_path / "log.csv", columns={"time": "time [ms]:ms", "q": "q_{j} [deg]"})
+    read = load(tmp_path / "log.csv", columns={"time": "time [ms]:ms", "q": "q_{j} [deg]:deg"})
+    np.testing.assert_allclose(read.q, r.q)
+
+
+def test_seconds_in_a_log_whose_source_writes_milliseconds_are_told(tmp_path):
+    r = made()
+    columns = {"time": r.time} | numbered("q_{j}", r.q) | numbered("tau_J_{j}", r.tau)
+    (tmp_path / "log.csv").write_text(table(columns))
+    with pytest.raises(InputError, match=r"looks like seconds .*--columns time=time:s"):
+        load(tmp_path / "log.csv")
+    np.testing.assert_allclose(load(tmp_path / "log.csv", columns={"time": "time:s"}).time, r.time)
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.npz"])
+def test_a_torque_that_is_zero_throughout_was_not_measured(tmp_path, name):
+    r = made()
+    (tmp_path / "log.csv").write_text(table(canonical(r) | numbered("tau_{j}", 0 * r.tau, 1)))
+    np.savez(tmp_path / "log.npz", time=r.time, q=r.q, dq=r.qd, tau=0 * r.tau)
+    read = load(tmp_path / name)
+    assert read.tau is None
+    assert any("tau is 0 throughout" in note for note in read.notes)
+
+
+def test_arrays_that_are_not_taken_are_named(tmp_path):
+    r = made()
+    np.savez(tmp_path / "log.npz", time=r.time, q=r.q, effort=r.tau)
+    assert any("effort" in note for note in load(tmp_path / "log.npz").notes)
+    np.savez(tmp_path / "turned.npz", time=r.time, q=r.q.T)
+    with pytest.raises(InputError, match="joints\\) is needed: transpose it"):
+        load(tmp_path / "turned.npz")
+
+
+@pytest.mark.parametrize(("row", "stamp", "part"), [(-1, 150000.0, "--to"), (0, -1.7e9, "--from")])
+def test_a_stamp_far_from_all_others_is_refused_before_the_time_between_is_filled(tmp_path, row, stamp, part):
+    r = made()
+    time = r.time.copy()
+    time[row] = stamp
+    (tmp_path / "log.csv").write_text(table(canonical(r, time=time)))
+    with pytest.raises(InputError, match=rf"time jumps from .*{part}"):
+        load(tmp_path / "log.csv")
+
+
+def test_wrapped_angles_that_were_resampled_are_refused(tmp_path):
+    t = np.arange(2000) / 250
+    q = 2.5 + 0.2 * t
+    wrapped = (q + np.pi) % (2 * np.pi) - np.pi
+    at = int(np.argmax(np.abs(np.diff(wrapped)) > 3))
+    wrapped[at + 1] = 0.3
+    np.savez(tmp_path / "log.npz", time=t, q=np.stack([wrapped, np.sin(t)], 1))
+    with pytest.raises(InputError, match="as where wrapped angles were resampled"):
+        load(tmp_path / "log.npz")
+
+
+@pytest.mark.parametrize(("row", "part"), [(-1, "--to"), (0, "--from")])
+def test_a_bad_position_in_the_first_or_last_row_is_cut_off_by_what_the_message_says(tmp_path, row, part):
+    r = made()
+    q = r.q.copy()
+    q[row, 1] -= 0.4
+    np.savez(tmp_path / "log.npz", time=r.time, q=q)
+    with pytest.raises(InputError, match=rf"leave those rows out \({part} ([\d.]+)\)") as error:
+        load(tmp_path / "log.npz")
+    at = float(str(error.value).split(part)[1].rstrip(")"))
+    reading = Reading(to=at) if part == "--to" else Reading(from_=at)
+    assert load(tmp_path / "log.npz", reading=reading).samples == r.samples - 1
+
+
+def test_a_file_of_raw_logs_has_a_unit(tmp_path):
+    r = made()
+    np.savetxt(tmp_path / "time.txt", 1e3 * r.time)
+    np.savetxt(tmp_path / "q.txt", r.q)
+    with pytest.raises(InputError, match="milliseconds"):
+        load(tmp_path)
+    np.testing.assert_allclose(load(tmp_path, columns={"time": "time.txt:ms"}).time, r.time)
+
+
 def test_options_that_choose_nothing_are_refused(tmp_path):
     (tmp_path / "rec.csv").write_text(table({"time": made().time} | numbered("q_{j}", made().q, 1)))
     for reading in (Reading(topic="/joint_states"), Reading(episode=("1",))):
