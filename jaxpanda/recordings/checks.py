@@ -149,10 +149,12 @@ def _unwrapped(recording: Recording, row: Callable[[int], str]) -> None:
                 f" then {recording.q[i - 1, j]:.4g} and {after:.4g} rad), as where wrapped angles were resampled:"
                 " unwrap them before that, as numpy.unwrap(q, axis=0) does"
             )
+        cure = (_without_edge(recording, i) if jumps.sum() == 1 else "") or (
+            ", where positions must be continuous: unwrap them, as numpy.unwrap(q, axis=0) does"
+        )
         raise InputError(
             f"{recording.name}: column q_{j + 1}, {row(i)}: the angle jumps by a turn ({before:.4g} rad, then "
-            f"{after:.4g} rad; {int(jumps.sum())} such jumps in all), where positions must be continuous: unwrap "
-            "them, as numpy.unwrap(q, axis=0) does"
+            f"{after:.4g} rad; {int(jumps.sum())} such jumps in all){cure}"
         )
 
 
@@ -164,7 +166,7 @@ def _continuous(recording: Recording) -> None:
     if recording.samples < 2:
         return
     every = float(np.median(np.diff(recording.time)))
-    stays = max(1, round(_STAYS / every))
+    stays = _rows_of(recording, _STAYS)
     for j, q in enumerate(recording.q.T):
         at = np.flatnonzero(np.diff(q)) + 1
         step, elapsed = q[at] - q[at - 1], np.diff(recording.time[np.r_[0, at]])
@@ -175,18 +177,27 @@ def _continuous(recording: Recording) -> None:
         for i, size in zip(at[alone], step[alone], strict=True):
             if not np.all((q[i : i + stays] - q[i - 1]) / size > 0.5):
                 continue
-            if min(i, len(q) - i) < stays:
-                where = ("beginning", "--from", i) if i < stays else ("end", "--to", i - 1)
-                raise InputError(
-                    f"{recording.name}: column q_{j + 1} jumps from {q[i - 1]:.4g} rad to {q[i]:.4g} rad at"
-                    f" {recording.time[i]:.6g} s, its {where[0]}: leave those rows out"
-                    f" ({where[1]} {recording.time[where[2]]:.10g})"
-                )
+            cure = _without_edge(recording, int(i)) or (
+                " and stays there, as where an encoder is reset while the log runs on, where positions must be"
+                " continuous: read one side of it (--to, --from), or record again"
+            )
             raise InputError(
                 f"{recording.name}: column q_{j + 1} jumps from {q[i - 1]:.4g} rad to {q[i]:.4g} rad at "
-                f"{recording.time[i]:.6g} s and stays there, as where an encoder is reset while the log runs "
-                "on, where positions must be continuous: read one side of it (--to, --from), or record again"
+                f"{recording.time[i]:.6g} s{cure}"
             )
+
+
+def _without_edge(recording: Recording, i: int) -> str:
+    """How to leave out the rows before a jump to row `i`, or from there on, where these are few; else nothing."""
+    stays = _rows_of(recording, _STAYS)
+    if min(i, recording.samples - i) >= stays:
+        return ""
+    where, option, kept = ("beginning", "--from", i) if i < stays else ("end", "--to", i - 1)
+    return f", its {where}: leave those rows out ({option} {recording.time[kept]:.10g})"
+
+
+def _rows_of(recording: Recording, duration: float) -> int:
+    return max(1, round(duration / float(np.median(np.diff(recording.time)))))
 
 
 def _radians(recording: Recording) -> None:

@@ -283,11 +283,14 @@ def test_wrapped_angles_that_were_resampled_are_refused(tmp_path):
         load(tmp_path / "log.npz")
 
 
+@pytest.mark.parametrize("off", [-0.4, 2 * np.pi])
 @pytest.mark.parametrize(("row", "part"), [(-1, "--to"), (0, "--from")])
-def test_a_bad_position_in_the_first_or_last_row_is_cut_off_by_what_the_message_says(tmp_path, row, part):
+def test_a_bad_position_in_the_first_or_last_row_is_cut_off_by_what_the_message_says(
+    tmp_path, row, part, off
+):
     r = made()
     q = r.q.copy()
-    q[row, 1] -= 0.4
+    q[row, 1] += off
     np.savez(tmp_path / "log.npz", time=r.time, q=q)
     with pytest.raises(InputError, match=rf"leave those rows out \({part} ([\d.]+)\)") as error:
         load(tmp_path / "log.npz")
