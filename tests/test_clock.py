@@ -1,5 +1,7 @@
 """Samples that were uniform are on their ticks, whatever their stamps say; others stay where they are."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -102,6 +104,15 @@ def test_stamps_rounded_to_milliseconds_are_finer_again():
     s = np.arange(3600) / 300
     made = on_clock(stamped(np.round(s, 3), s))
     np.testing.assert_allclose(np.diff(made.time), 1 / 300, rtol=1e-4)
+
+
+def test_stamps_in_32_bits_after_hours_are_no_clock_of_their_own():
+    """Steps of 3.9 and 7.8 ms had been a clock of 256 Hz that misses rows."""
+    s = np.arange(3000) / 250
+    made = on_clock(stamped((60000 + s).astype(np.float32).astype(float), s))
+    np.testing.assert_allclose(np.diff(made.time), 1 / 250, rtol=1e-3)
+    assert "ticks missing between rows" not in made.repairs
+    assert acceleration_error(dataclasses.replace(made, time=made.time - 60000)) < 0.02
 
 
 def test_ticks_go_on_beyond_a_gap():

@@ -124,9 +124,13 @@ def on_clock(recording: Recording) -> Recording:
 
 
 def _is_regular(time: Float[np.ndarray, " time"]) -> bool:
-    """Whether stamps are ticks already, but for whole ones that are missing."""
+    """Whether stamps are ticks already, but for whole ones that are missing; multiples of what 32 bits resolve
+    are none."""
     steps = np.diff(time)
     period = float(np.median(steps))
+    short = time.astype(np.float32)
+    if np.array_equal(short, time) and np.spacing(np.abs(short).max()) > _EXACT * period:
+        return False
     return bool(np.all(np.abs(steps - np.round(steps / period) * period) <= _EXACT * period))
 
 

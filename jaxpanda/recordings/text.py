@@ -56,7 +56,7 @@ def _first_fault(
     lines: list[str], delimiter: str | None, columns: list[str], first_line: int, wanted: set[int]
 ) -> str:
     """What keeps the columns wanted from being numbers; empty where nothing does."""
-    row = 0
+    row, last = 0, max((number for number, line in enumerate(lines, first_line) if line.strip()), default=0)
     for number, line in enumerate(lines, first_line):
         if not line.strip():
             continue
@@ -69,8 +69,12 @@ def _first_fault(
         if len(cells) != len(columns):
             return (
                 f"{where} has {len(cells)} cell{'s' * (len(cells) != 1)}, where the columns are "
-                f"{len(columns)} ({columns[0]} ... {columns[-1]}): every row must have as many cells as "
-                "there are columns"
+                f"{len(columns)} ({columns[0]} ... {columns[-1]}): "
+                + (
+                    "the last line was cut off: take it away"
+                    if number == last and row > 1 and len(cells) < len(columns)
+                    else "every row must have as many cells as there are columns"
+                )
             )
         for place, (column, cell) in enumerate(zip(columns, cells, strict=True)):
             if place not in wanted:

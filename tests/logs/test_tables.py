@@ -217,6 +217,13 @@ def test_rostopic_s_header_is_a_comment_above_rows_with_text(tmp_path):
     np.testing.assert_allclose(read.q, r.q)
 
 
+def test_a_last_line_that_was_cut_off_is_told_as_that(tmp_path):
+    text = table(canonical(made()))
+    (tmp_path / "log.csv").write_text(text[: text.rindex(",")].rstrip())
+    with pytest.raises(InputError, match="the last line was cut off: take it away"):
+        load(tmp_path / "log.csv")
+
+
 def test_a_spreadsheet_s_first_line_is_no_header(tmp_path):
     (tmp_path / "log.csv").write_text("sep=;\n" + table(canonical(made()), ";"))
     assert_same(load(tmp_path / "log.csv"), made())
