@@ -39,7 +39,7 @@ from jaxpanda.diagnosis.written import buildable, corrected_document, worsened
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
 from jaxpanda.effects.drive import Backlash, JointElasticity
-from jaxpanda.effects.friction import CoulombFriction, FrictionDrift, PowerLawFriction
+from jaxpanda.effects.friction import CoulombFriction, FrictionDrift, PowerLawFriction, ViscousFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.motion import masses
 from jaxpanda.effects.sensing import TorqueCrosstalk, TorqueOffset
@@ -388,6 +388,20 @@ def test_links_that_no_body_has_give_way_unless_the_user_s_model_is_nearer(own_p
     traces = tuple(dataclasses.replace(t, tau=t.tau + beside) for t in problem.traces)
     built = buildable(source, lighter, dataclasses.replace(problem, traces=traces))
     assert are_buildable(np.asarray(built.native.standard)) == (beside > 0)
+
+
+def test_a_number_that_came_out_below_zero_is_told(own_panda):
+    """Beside a sensor's gain a damping of 350 became -41, and 0 in corrected.xml without a word."""
+    arm, source, problem = own_panda
+    damped = eqx.tree_at(lambda a: a.damping, arm, arm.damping.at[3].set(1.0))
+    zeros = jnp.zeros(7)
+    law = ViscousFriction(3)
+    for coefficient, told in ((-3.0, True), (-0.5, False)):
+        corrected = Corrected(damped, jnp.zeros((7, 10)), zeros, zeros, (law,), (jnp.array([coefficient]),))
+        document, notes = corrected_document(source, corrected, problem)
+        assert any("below zero" in note and "damping -2 at joint 4" in note for note in notes) == told
+        after, _ = from_document(document)
+        assert float(after.damping[3]) == max(0.0, 1 + coefficient)
 
 
 def test_what_the_file_cannot_hold_is_said_once(written):

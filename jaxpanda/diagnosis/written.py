@@ -25,6 +25,8 @@ from .problem import Problem
 
 UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""
+_ROUNDING = 0.01
+"""Share of the file's number by which one below zero counts as zero."""
 _WORSE = 1.1
 """Ratio of errors from which a joint counts as worse."""
 
@@ -70,6 +72,7 @@ def corrected_document(
     values = tuple(
         getattr(native, n) if n == "springref" else jnp.maximum(getattr(native, n), 0.0) for n in names
     )
+    warnings += _below_zero(native, corrected.arm)
     arm = eqx.tree_at(lambda a: tuple(getattr(a, n) for n in names), corrected.arm, values)
     result, told = _with_links(source, arm, np.asarray(native.standard) if moved else None, problem)
     warnings += told
@@ -81,6 +84,18 @@ def corrected_document(
         except InputError as error:
             warnings.append(f"corrected.xml: gravity should be {value}: {error}")
     return document, (*warnings, *result.warnings)
+
+
+def _below_zero(native: Arm, before: Arm) -> list[str]:
+    """A sentence on numbers that a sensor's gain or delay leaves below zero, by more than rounding."""
+    told = []
+    for name in ("armature", "damping", "frictionloss", "stiffness"):
+        new, old = (np.asarray(getattr(arm, name)) for arm in (native, before))
+        joints = np.flatnonzero(new < -_ROUNDING * np.abs(old) - 1e-9)
+        told += [f"{name} {new[j]:.3g} at joint {j + 1}" for j in joints]
+    if not told:
+        return []
+    return [f"corrected.xml has 0 for what came out below zero, which no MJCF can hold: {', '.join(told)}"]
 
 
 def worsened(
