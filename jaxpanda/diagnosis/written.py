@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..arms import markup
 from ..arms.arm import Arm
 from ..arms.export import ExportResult, edit_mjcf, write_parameters
-from ..arms.mjcf import MjcfSource
+from ..arms.mjcf import KNOWN, MjcfSource
 from ..arms.source import from_document
 from ..corrected import Corrected
 from ..effects import AbstractEffect
@@ -25,6 +25,8 @@ from .problem import Problem
 
 UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""
+_NOT_NEGATIVE = tuple(name for name in KNOWN if name != "springref")
+"""An arm's numbers that MuJoCo takes from zero on."""
 _ROUNDING = 0.01
 """Share of the file's number by which one below zero counts as zero."""
 _WORSE = 1.1
@@ -68,12 +70,11 @@ def corrected_document(
     corrected, warnings = with_nearest(corrected, problem)
     native = corrected.native
     moved = moved or any(hasattr(e, "standard_change") for e in corrected.effects)
-    names = ("armature", "damping", "frictionloss", "stiffness", "springref")
     values = tuple(
-        getattr(native, n) if n == "springref" else jnp.maximum(getattr(native, n), 0.0) for n in names
+        jnp.maximum(getattr(native, n), 0.0) if n in _NOT_NEGATIVE else getattr(native, n) for n in KNOWN
     )
     warnings += _below_zero(native, corrected.arm)
-    arm = eqx.tree_at(lambda a: tuple(getattr(a, n) for n in names), corrected.arm, values)
+    arm = eqx.tree_at(lambda a: tuple(getattr(a, n) for n in KNOWN), corrected.arm, values)
     result, told = _with_links(source, arm, np.asarray(native.standard) if moved else None, problem)
     warnings += told
     document = result.document
@@ -89,7 +90,7 @@ def corrected_document(
 def _below_zero(native: Arm, before: Arm) -> list[str]:
     """A sentence on numbers that a sensor's gain or delay leaves below zero, by more than rounding."""
     told = []
-    for name in ("armature", "damping", "frictionloss", "stiffness"):
+    for name in _NOT_NEGATIVE:
         new, old = (np.asarray(getattr(arm, name)) for arm in (native, before))
         joints = np.flatnonzero(new < -_ROUNDING * np.abs(old) - 1e-9)
         told += [f"{name} {new[j]:.3g} at joint {j + 1}" for j in joints]

@@ -86,14 +86,15 @@ def read_bag(path: Path, reading: Reading) -> list[Recording]:
         topic, kind = _topic(path, bag, reading)
         inputs.require_size(path.name, bag.topics[topic].msgcount)
         samples = _samples(bag, topic)
-        columns = _columns(samples)
+        columns, stamped = _columns(samples), any(_stamp(message) is not None for _, message in samples)
         taken: dict[str, int] = {}
 
         def take(places: Sequence[int]) -> np.ndarray:
-            return _take(bag, topic, path.name, [list(columns)[i] for i in places], columns, taken)
+            wanted = [list(columns)[i] for i in places]
+            return _take(bag, topic, path.name, wanted, columns, taken, stamped)
 
         notes = (f"topic {topic} ({_short(kind)})",)
-        if not any(_has_stamp(message) for _, message in samples):
+        if not stamped:
             notes += ("its messages have no stamps: time is when they were received",)
         table = Table(
             path, path.name, list(columns), take, lambda i: f"message {i + 1}", notes, lambda: taken
@@ -211,10 +212,6 @@ def _numbers(message: Any, path: tuple[str, ...]) -> Iterator[tuple[str, _Column
             yield ".".join(below), _Column(below)
 
 
-def _has_stamp(message: Any) -> bool:
-    return _stamp(message) is not None
-
-
 def _stamp(message: Any) -> int | None:
     """The header's stamp, or KUKA's own [ns]; None where there is none."""
     if (header := getattr(message, "header", None)) is not None:
@@ -225,13 +222,18 @@ def _stamp(message: Any) -> int | None:
 
 
 def _take(
-    bag: Any, topic: str, name: str, wanted: Sequence[str], columns: dict[str, _Column], taken: dict[str, int]
+    bag: Any,
+    topic: str,
+    name: str,
+    wanted: Sequence[str],
+    columns: dict[str, _Column],
+    taken: dict[str, int],
+    stamped: bool,
 ) -> np.ndarray:
     """The columns wanted, a row a message; a message that lacks one of their joints is another device's."""
     rows: list[list[float]] = []
     stamps: list[int] = []
     first: dict[str, int] = {}
-    stamped = any(_has_stamp(message) for _, message in _samples(bag, topic))
     read = other = repeated = 0
     for received, message in _messages(bag, topic):
         stamp = _stamp(message)

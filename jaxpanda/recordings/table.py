@@ -353,8 +353,7 @@ def _stated(channel: str, name: str) -> str:
 def _stated_units(table: Table, said: Mapping[str, str], mapping: Mapping[str, str]) -> None:
     """Refuse what the user says of a column whose name gives another unit than what is said."""
     for channel, where in said.items():
-        stem, _, joint = channel.rpartition("_")
-        base = stem if joint.isdecimal() else channel
+        base = _of_all_joints(channel)
         name = mapping.get(channel, mapping.get(f"{channel}_1", ""))
         unit = _stated(base, name)
         if unit and (where in table.names or not split_unit(where)[1]):
@@ -420,13 +419,17 @@ def factor_of(channel: str, where: str) -> float:
     Raises:
         InputError: it is no unit of such a channel.
     """
-    unit = split_unit(where)[1]
-    stem, _, joint = channel.rpartition("_")
-    base = stem if joint.isdecimal() else channel
+    unit, base = split_unit(where)[1], _of_all_joints(channel)
     if unit and unit not in UNITS.get(base, {}):
         has = ", ".join(UNITS[base]) if base in UNITS else "none here; torque's is said by --torque-unit"
         raise InputError(f"--columns {channel}={where}: {unit} is no unit of {base}; its units are {has}")
     return UNITS[base][unit] if unit else 1.0
+
+
+def _of_all_joints(channel: str) -> str:
+    """q of q_3."""
+    stem, _, joint = channel.rpartition("_")
+    return stem if joint.isdecimal() else channel
 
 
 def split_unit(where: str) -> tuple[str, str]:
@@ -484,13 +487,12 @@ def _mapping(table: Table, channel: str, where: str) -> dict[str, str]:
     if where not in table.names:
         factor_of(channel, where)
         plain = split_unit(where)[0]
-    joint = channel.rpartition("_")[2]
     columns = _expand(table.names, plain)
     if not columns:
         raise InputError(
             f"{table.name}: no column {plain!r} (asked for as {channel}); it has {listed(table.names)}"
         )
-    if channel == "time" or joint.isdecimal():
+    if channel == "time" or _of_all_joints(channel) != channel:
         if len(columns) > 1:
             raise InputError(f"{table.name}: {plain!r} is {len(columns)} columns, where {channel} is one")
         return {channel: columns[0]}

@@ -49,7 +49,10 @@ def numbers(
         return table[:, wanted]
     if fault := _first_fault(lines, delimiter, columns, first_line, set(wanted)):
         raise InputError(f"{name}: {fault}")
-    return np.loadtxt(lines, dtype=float, delimiter=delimiter, comments=None, ndmin=2, usecols=wanted)
+    try:
+        return np.loadtxt(lines, dtype=float, delimiter=delimiter, comments=None, ndmin=2, usecols=wanted)
+    except ValueError:  # Python takes 1_000 for a number
+        raise InputError(f"{name}: the rows cannot be read as numbers") from None
 
 
 def _first_fault(

@@ -205,6 +205,12 @@ def test_text_in_a_column_that_is_not_taken_is_no_matter_and_one_that_is_names_i
         load(tmp_path / "log.csv")
 
 
+def test_what_python_takes_for_a_number_and_numpy_does_not_is_a_sentence(tmp_path):
+    (tmp_path / "log.csv").write_text(table(canonical(made())).replace("\n0.0,", "\n0_0.0,", 1))
+    with pytest.raises(InputError, match="cannot be read as numbers"):
+        load(tmp_path / "log.csv")
+
+
 def test_rostopic_s_header_is_a_comment_above_rows_with_text(tmp_path):
     r = made()
     columns = {"time": np.round(1e9 * r.time)} | numbered("field.position{j}", r.q)
