@@ -97,6 +97,9 @@ class Corrected(eqx.Module):
     cutoffs: tuple[float | None, ...] = eqx.field(default=(), static=True)
     """Up to which a prediction takes motion into account in each joint's torque [Hz], as that of the recordings
     showed it; None, or no entries: as far as q shows it."""
+    friction_shown: Float[Array, "2 dof"] | None = None
+    """Viscous [N m s/rad] and Coulomb friction [N m] of the recordings beyond the model's: of the sensors' laws,
+    those in proportion to torque were fitted to torque with this friction. None, where it is the model's."""
     recorded: Recorded | None = eqx.field(default=None, static=True)
     """The recordings that told all this, for what changes with time; None where each began anew."""
 
@@ -268,6 +271,9 @@ class Corrected(eqx.Module):
             "frictionloss_change": np.asarray(self.frictionloss_change).tolist(),
             "turns": [None if turn is None else {turn.over: turn.size} for turn in self.turns],
             "cutoffs": list(self.cutoffs),
+            "friction_shown": None
+            if self.friction_shown is None
+            else np.asarray(self.friction_shown).tolist(),
             "recorded": None if self.recorded is None else dataclasses.asdict(self.recorded),
             "effects": [
                 {**effect.to_json(), "coefficients": np.asarray(c).tolist()}
@@ -300,6 +306,7 @@ class Corrected(eqx.Module):
             tuple(numbers(e["coefficients"]) for e in document["effects"]),
             _turns(document),
             tuple(None if x is None else float(x) for x in document.get("cutoffs") or ()),
+            None if document.get("friction_shown") is None else numbers(document["friction_shown"]),
             Recorded.from_json(document.get("recorded")),
         )
 
@@ -375,8 +382,11 @@ def _check_numbers(found: Corrected, noise: np.ndarray) -> None:
         "frictionloss_change": np.asarray(found.frictionloss_change),
         "torque_noise": noise,
     }
+    if found.friction_shown is not None:
+        named["friction_shown"] = np.asarray(found.friction_shown)
+    shapes = {"standard": (n, 10), "change": (n, 10), "friction_shown": (2, n)}
     for name, values in named.items():
-        shape = (n, 10) if name in ("standard", "change") else (n,)
+        shape = shapes.get(name, (n,))
         if values.shape != shape or not (name in ("lower", "upper") or np.isfinite(values).all()):
             raise ValueError(f"{name} must hold {' x '.join(map(str, shape))} numbers")
     if len(found.cutoffs) not in (0, n) or not all(x is None or 0 < x < np.inf for x in found.cutoffs):

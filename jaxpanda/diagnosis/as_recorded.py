@@ -100,6 +100,7 @@ def predicted(moved: Trajectory, corrected: Corrected) -> tuple[Trace, Float[np.
     cutoffs = corrected.cutoffs or (None,) * corrected.arm.dof
     for cutoff in dict.fromkeys(cutoffs):
         trace = moved.trace(corrected.arm, corrected.turns, np.inf if cutoff is None else cutoff)
+        trace = trace.showing(corrected.friction_shown)
         out[cutoff] = trace, corrected.measured_torque(trace.motion, trace.channels, trace.sign)
     torque = np.stack([out[cutoff][1][:, joint] for joint, cutoff in enumerate(cutoffs)], 1)
     return out[cutoffs[0]][0], torque

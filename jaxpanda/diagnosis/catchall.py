@@ -67,7 +67,7 @@ def build(traces: Sequence[Trace]) -> list[Candidates]:
         if largest > _SLOW:
             alike["of dq_i * dq_k", 0] += [UnknownOfSpeeds(j, i, k, largest) for j in range(dof)]
 
-    largest = np.max([np.abs(t.motion.torque).max(0) for t in traces], 0)
+    largest = np.max([np.abs(t.motion.torque_shown).max(0) for t in traces], 0)
     for j in np.flatnonzero(largest > 0):
         alike["limit", 0] += [UnknownLimit(int(j), float(share * largest[j])) for share in _LIMITS]
 

@@ -29,6 +29,7 @@ from .calibration import SMALL, are_told, calibrated, is_large
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import VERDICTS, Finding, Fit
+from .friction_shown import friction_shown
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .posterior import posterior_of
@@ -190,6 +191,8 @@ def sought(
     """
     progress("looking for effects that make the recordings likelier; that takes most of the time")
     log = _Log(progress)
+    shown = friction_shown([t for t, on in zip(traces, active, strict=True) if on])
+    traces = [t.showing(shown) for t in traces]
     premises, searched = settled(tuple(traces), tuple(active), knowledge, log, catalogue=catalogue)
     problem = premises.problem
     progress("refining the numbers, and weighing what else it could be")
@@ -202,7 +205,7 @@ def sought(
         kept = with_terms(problem, [t for t in kept.terms if all(t is not d for d in doubtful)])
     background = premises.background if kept.terms or wrong else ()
     lasting = [t for t, on in zip(premises.background, premises.lasting, strict=True) if background and on]
-    correct = lambda by: _corrected(arm, premises, lasting, by, refitted=bool(by.terms or wrong))
+    correct = lambda by: _corrected(arm, shown, premises, lasting, by, refitted=bool(by.terms or wrong))
     corrected = correct(kept)
     moved = [trajectory(recording) for recording in recordings]
     added = [*lasting, *kept.terms]
@@ -427,7 +430,13 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
 
 
 def _corrected(
-    arm: Arm, premises: Premises, lasting: Sequence[Term], state: State, *, refitted: bool
+    arm: Arm,
+    shown: Float[np.ndarray, "2 dof"],
+    premises: Premises,
+    lasting: Sequence[Term],
+    state: State,
+    *,
+    refitted: bool,
 ) -> Corrected:
     """The arm with the terms and, where `refitted`, with what they leave of the nuisance; of what healthy
     recordings show, with what is `lasting`."""
@@ -448,5 +457,11 @@ def _corrected(
         effects.append(term.effect.beyond(recorded))
         values.append(jnp.asarray(coefficients(state, i)))
     return Corrected(
-        arm, jnp.asarray(change), jnp.asarray(damping), jnp.asarray(level), tuple(effects), tuple(values)
+        arm,
+        jnp.asarray(change),
+        jnp.asarray(damping),
+        jnp.asarray(level),
+        tuple(effects),
+        tuple(values),
+        friction_shown=jnp.asarray(shown),
     )

@@ -389,7 +389,7 @@ def lag_profile(
     """Lags of a joint's torque [s], and what the log likelihood of the residual gains by each."""
     columns = []
     for trace, on in zip(problem.traces, problem.active, strict=True):
-        torque, time = trace.motion.torque[:, joint], trace.motion.time
+        torque, time = trace.motion.torque_shown[:, joint], trace.motion.time
         late = [np.interp(time - d, time, torque) - torque for d in _LAGS]
         columns.append(np.stack(late, 1) * on)
     Phi = problem.whitened(columns, noise, joint)[:, :, None]

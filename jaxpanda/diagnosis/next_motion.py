@@ -366,7 +366,7 @@ def _placed(
             trace.cutoff,
             sign,
             np.ones((len(keep), arm.dof)),
-        )
+        ).showing(trace.friction_shown)
         out.append(posed((new,), (True,), nuisance([new], spread, knowledge, exact)[0], background))
     return out
 

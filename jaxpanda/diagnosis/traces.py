@@ -98,6 +98,8 @@ class Trace:
     """1 where the sign of a joint's velocity cannot be told, else 0: friction at rest may carry any load."""
     stuck: tuple[tuple[int, float, float], ...] = ()
     """Joint, start and stop [s] of stretches in which measured torque repeats itself although it must change."""
+    friction_shown: Float[Array | np.ndarray, "2 dof"] | None = None
+    """Of `showing`."""
 
     @functools.cached_property
     def stretches(self) -> Stretches:
@@ -135,6 +137,17 @@ class Trace:
         below = [signals_.zero_phase(qdd, cutoff, rate) for cutoff in _SHAKEN if cutoff < 0.45 * rate]
         bands = [high - low for low, high in itertools.pairwise([*below, qdd])]
         return np.concatenate([self.motion.mass * band[:, None] for band in bands], 2)
+
+    def showing(self, friction: Float[Array | np.ndarray, "2 dof"] | None) -> "Trace":
+        """The same, where recordings show so much more friction than the model has: viscous [N m s/rad] and
+        Coulomb [N m]; None for as much."""
+        if friction is None:
+            return self
+        viscous, coulomb = np.asarray(friction)
+        more = viscous * self.channels.qd + coulomb * self.sign
+        channels = dataclasses.replace(self.channels, torque=self.channels.torque + more)
+        motion = self.motion.showing(self.down(more))
+        return dataclasses.replace(self, channels=channels, motion=motion, friction_shown=friction)
 
     def down(self, fine: Float[np.ndarray, "fine ..."]) -> Float[np.ndarray, "time ..."]:
         """From the fine grid to the coarse one, filtered like the torque."""

@@ -216,4 +216,5 @@ def both(arm: Arm, links: Corrected, drives: Corrected) -> Corrected:
         tuple(e for e, _ in pairs),
         tuple(c for _, c in pairs),
         drives.turns,
+        friction_shown=drives.friction_shown,
     )

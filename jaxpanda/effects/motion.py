@@ -1,5 +1,6 @@
 """What effects are evaluated on: the motion of an arm on a uniform grid, and the nominal model's torque in it."""
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -26,7 +27,7 @@ class Channels(eqx.Module):
     load: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"]
     """Torque that the nominal rigid arm transmits [N m]."""
     torque: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"]
-    """Torque of the whole nominal model, friction included [N m]."""
+    """Torque of the nominal model with the friction that recordings show, as sensors scale and delay it [N m]."""
     shown: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"] | None = None
     """Torque that the sensors show [N m]; None where they tell nothing, and the model's is the best there is."""
 
@@ -34,8 +35,9 @@ class Channels(eqx.Module):
 class Motion:
     """A motion on a uniform grid; what the nominal arm says about it is computed once, when asked for.
 
-    `friction` is the torque of the friction that the nominal model holds [N m]; `transmitted` what the drives
-    pass on to the links, where that was measured and the arm's links are left to it.
+    `friction` is the torque of the friction that the nominal model holds [N m], `friction_shown` of that which
+    recordings show, the nominal one where none was estimated; `transmitted` what the drives pass on to the links,
+    where that was measured and the arm's links are left to it.
     """
 
     def __init__(
@@ -49,7 +51,7 @@ class Motion:
         transmitted: Float[np.ndarray, "time dof"] | None = None,
     ):
         self.arm, self.time, self.q, self.qd, self.qdd, self.friction = arm, time, q, qd, qdd, friction
-        self.transmitted = transmitted
+        self.friction_shown, self.transmitted = friction, transmitted
         self.dt = float(time[1] - time[0])
 
     @property
@@ -133,6 +135,17 @@ class Motion:
     def torque(self) -> Float[np.ndarray, "time dof"]:
         """Torque of the whole nominal model [N m]."""
         return self.load + self.friction
+
+    @property
+    def torque_shown(self) -> Float[np.ndarray, "time dof"]:
+        """The same with the friction that recordings show [N m]."""
+        return self.load + self.friction_shown
+
+    def showing(self, more: Float[np.ndarray, "time dof"]) -> "Motion":
+        """The motion, where recordings show so much more friction than the nominal model has [N m]."""
+        motion = copy.copy(self)
+        motion.friction_shown = self.friction + more
+        return motion
 
     def _over(self, function: Callable, *arrays: np.ndarray) -> np.ndarray:
         return chunked(function, self.arm.nameless, *arrays)

@@ -323,7 +323,7 @@ class TimeDelay(AbstractArmEffect):
         d, joints = float(self.around), list(self.joints)
         cutoff = _DELAY_CUTOFF if self.form.startswith("smooth") else np.inf
         load = low_passed(motion.load[:, joints], cutoff, motion.dt)
-        torque, then = load + motion.friction[:, joints], motion.time - self._sign * d
+        torque, then = load + motion.friction_shown[:, joints], motion.time - self._sign * d
         if self._filters:
             kept, old, new = (float(x) for x in _low_pass(motion.dt, d))
             whole = _with_before(torque)

@@ -157,7 +157,7 @@ class Ensemble:
         found = self.corrected
         assert found is not None
         arm, later = found.for_motion(motion)
-        trace = trajectory(later).trace(self.arm)
+        trace = trajectory(later).trace(self.arm).showing(found.friction_shown)
         shown = arm.measured_torque(trace.motion, trace.channels, trace.sign)
         change = (self.standard[chosen] - np.asarray(self.arm.standard)).reshape(len(chosen), -1)
         tau = trace.motion.torque + np.einsum("tjp,mp->mtj", trace.motion.regressor, change, optimize=True)
