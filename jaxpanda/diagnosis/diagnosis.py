@@ -205,7 +205,7 @@ def sought(
         kept = with_terms(problem, [t for t in kept.terms if all(t is not d for d in doubtful)])
     background = premises.background if kept.terms or wrong else ()
     lasting = [t for t, on in zip(premises.background, premises.lasting, strict=True) if background and on]
-    correct = lambda by: _corrected(arm, shown, premises, lasting, by, refitted=bool(by.terms or wrong))
+    correct = lambda by: _corrected(arm, premises, lasting, by, refitted=bool(by.terms or wrong))
     corrected = correct(kept)
     moved = [trajectory(recording) for recording in recordings]
     added = [*lasting, *kept.terms]
@@ -430,13 +430,7 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
 
 
 def _corrected(
-    arm: Arm,
-    shown: Float[np.ndarray, "2 dof"],
-    premises: Premises,
-    lasting: Sequence[Term],
-    state: State,
-    *,
-    refitted: bool,
+    arm: Arm, premises: Premises, lasting: Sequence[Term], state: State, *, refitted: bool
 ) -> Corrected:
     """The arm with the terms and, where `refitted`, with what they leave of the nuisance; of what healthy
     recordings show, with what is `lasting`."""
@@ -456,6 +450,7 @@ def _corrected(
     for i, term in enumerate(state.terms):
         effects.append(term.effect.beyond(recorded))
         values.append(jnp.asarray(coefficients(state, i)))
+    shown = problem.traces[0].friction_shown
     return Corrected(
         arm,
         jnp.asarray(change),
@@ -463,5 +458,5 @@ def _corrected(
         jnp.asarray(level),
         tuple(effects),
         tuple(values),
-        friction_shown=jnp.asarray(shown),
+        friction_shown=None if shown is None else jnp.asarray(shown),
     )
