@@ -97,11 +97,11 @@ class Corrected(eqx.Module):
     cutoffs: tuple[float | None, ...] = eqx.field(default=(), static=True)
     """Up to which a prediction takes motion into account in each joint's torque [Hz], as that of the recordings
     showed it; None, or no entries: as far as q shows it."""
+    recorded: Recorded | None = eqx.field(default=None, static=True)
+    """The recordings that told all this, for what changes with time; None where each began anew."""
     friction_shown: Float[Array, "2 dof"] | None = None
     """Viscous [N m s/rad] and Coulomb friction [N m] of the recordings beyond the model's: of the sensors' laws,
     those in proportion to torque were fitted to torque with this friction. None, where it is the model's."""
-    recorded: Recorded | None = eqx.field(default=None, static=True)
-    """The recordings that told all this, for what changes with time; None where each began anew."""
 
     @property
     def native(self) -> Arm:
@@ -306,8 +306,8 @@ class Corrected(eqx.Module):
             tuple(numbers(e["coefficients"]) for e in document["effects"]),
             _turns(document),
             tuple(None if x is None else float(x) for x in document.get("cutoffs") or ()),
-            None if document.get("friction_shown") is None else numbers(document["friction_shown"]),
             Recorded.from_json(document.get("recorded")),
+            None if document.get("friction_shown") is None else numbers(document["friction_shown"]),
         )
 
 

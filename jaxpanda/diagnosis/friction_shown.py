@@ -22,10 +22,11 @@ def friction_shown(traces: Sequence[Trace]) -> Float[np.ndarray, "2 dof"]:
     Least squares of measured torque less the rigid arm's on velocity, its sign, the arm's torque and a constant:
     $\tau_j - \tau_{r,j} = d\,\dot q_j + f\,\mathrm{sign}(\dot q_j) + a\,\tau_{r,j} + b$.
     """
-    dof = traces[0].motion.dof
-    out = np.zeros((2, dof))
+    arm = traces[0].motion.arm
+    out = np.zeros((2, arm.dof))
+    lowest = np.array([0.0, 0.0, -np.inf, -np.inf])
     signs = [t.down(t.sign) for t in traces]
-    for j in range(dof):
+    for j in range(arm.dof):
         weight = np.concatenate([t.weights[:, j] for t in traces])
         if not weight.any():
             continue
@@ -33,13 +34,11 @@ def friction_shown(traces: Sequence[Trace]) -> Float[np.ndarray, "2 dof"]:
         qd = np.concatenate([t.motion.qd[:, j] for t in traces])
         sign = np.concatenate([s[:, j] for s in signs])
         left = np.concatenate([np.asarray(t.tau)[:, j] for t in traces]) - load
-        arm = traces[0].motion.arm
         usual = np.array([float(arm.damping[j]), float(arm.frictionloss[j]), 0.0, 0.0])
         A = weight[:, None] * np.stack([qd, sign, load, np.ones_like(load)], 1)
         size = np.maximum(np.linalg.norm(A, axis=0), 1e-12)
         A = np.concatenate([A / size, np.sqrt(_TRUST) * np.eye(4)])
         y = np.concatenate([weight * left, np.sqrt(_TRUST) * usual * size])
-        lowest = np.array([0.0, 0.0, -np.inf, -np.inf])
-        found = scipy.optimize.lsq_linear(A, y, (lowest, np.full(4, np.inf)), method="bvls").x / size
+        found = scipy.optimize.lsq_linear(A, y, (lowest, np.inf), method="bvls").x / size
         out[:, j] = found[:2] - usual[:2]
     return out

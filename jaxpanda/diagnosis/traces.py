@@ -99,7 +99,7 @@ class Trace:
     stuck: tuple[tuple[int, float, float], ...] = ()
     """Joint, start and stop [s] of stretches in which measured torque repeats itself although it must change."""
     friction_shown: Float[Array | np.ndarray, "2 dof"] | None = None
-    """Of `showing`."""
+    """How much more friction than the model's recordings show, where `showing` was told."""
 
     @functools.cached_property
     def stretches(self) -> Stretches:
