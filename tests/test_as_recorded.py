@@ -69,6 +69,34 @@ def test_friction_of_the_model_turns_in_predictions_as_it_did_in_the_recordings(
     assert unheard == ((turns[0], max(others, key=others.count), *turns[2:]) if turns else ())
 
 
+def test_bristles_that_one_moment_shows_and_the_rest_of_a_recording_does_not_are_not_taken():
+    """In sum they are nearer; a motion with other moments had been predicted worse with them."""
+    rng, time = np.random.default_rng(7), np.arange(0, 12.0, 2e-3)
+    arm = dataclasses.replace(Arm.panda(), frictionloss=jnp.zeros(7).at[2].set(0.5))
+    shakes = (time > 4.2) & (time < 5.8)
+    qd = np.where(shakes, 0.06 * np.sin(2 * np.pi * 2.5 * (time - 4.2)), 0.01)
+    q = np.tile(0.5 * np.asarray(arm.lower + arm.upper), (len(time), 1))
+    q += 0.05 * np.cos(0.7 * time[:, None] + np.arange(7))
+    q[:, 2] = 2e-3 * np.cumsum(qd)
+    still = Recording("shaken.csv", time, q, tau=np.zeros_like(q))
+    tau = trajectory(still).trace(dataclasses.replace(arm, frictionloss=jnp.zeros(7))).motion.torque
+    tau[:, 2] += 0.5 * np.where(shakes, dahl(q[:, 2], 1.5e-3, 1.0), np.tanh(qd / 0.01))
+    moved = [trajectory(dataclasses.replace(still, tau=tau + NOISE * rng.normal(size=q.shape)))]
+    zeros = jnp.zeros(7)
+    corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
+    error = [
+        np.std(
+            predicted(moved[0], dataclasses.replace(corrected, turns=(None, None, turn) + (None,) * 4))[1][
+                :, 2
+            ]
+            - tau[:, 2]
+        )
+        for turn in (SPEED, BRISTLES)
+    ]
+    assert error[1] < 0.9 * error[0]
+    assert as_recorded(moved, corrected, JUDGED).turns[2] == SPEED
+
+
 def test_a_speed_over_which_friction_turns_in_all_joints_is_still_read():
     """As earlier versions wrote it."""
     zeros = jnp.zeros(7)

@@ -34,7 +34,7 @@ from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
 from jaxpanda.diagnosis.search import crossed, exchange, instead, transferable
 from jaxpanda.diagnosis.state import torque, with_terms
-from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.diagnosis.traces import prepare, trajectory
 from jaxpanda.diagnosis.written import buildable, corrected_document, worsened
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
@@ -749,7 +749,16 @@ def perturbed(seed: int) -> Arm:
 def test_a_roughly_known_arm_raises_no_alarm_and_its_friction_is_named():
     arm = perturbed(5)
     healthy = [record(2, arm=arm), record(3, arm=arm)]
-    assert diagnose(None, healthy, knowledge="rough").verdict == "consistent"
+    result = diagnose(None, healthy, knowledge="rough")
+    assert result.verdict == "consistent"
+    (note,) = (n for n in result.notes if "refitted as “rough” allows" in n)
+    assert "inertial parameters" in note
+    # though nothing is missing, the file gets the numbers that torque shows
+    later = record(4, arm=arm)
+    file, _ = from_document(result.written)
+    user_s, corrected = (np.std(trajectory(later).trace(one).residual, axis=0) for one in (Arm.panda(), file))
+    assert user_s.max() > 1.4 * NOISE
+    np.testing.assert_allclose(corrected, NOISE, rtol=0.05)
     rubbing = at_joint(5, lambda t, q, qd, qdd: 0.3 * np.tanh(qd[:, 4] / 0.005))
     result = diagnose(None, [record(2, rubbing, arm=arm), record(3, rubbing, arm=arm)], knowledge="rough")
     assert [(f.effect, f.joints) for f in result.findings] == [("coulomb_friction", (4,))]

@@ -3,7 +3,9 @@ r"""What a prediction has to say of the recordings' torque that a diagnosis need
 How friction turns: MuJoCo's constraint holds a joint almost without creep; the bristles of a gear yield by some
 mrad, and what they hold at rest depends on where the joint came from; $\tanh(\dot q/v)$ is about their mean over
 many motions. And how much of fast motion the torque shows: its channel may be filtered more than q is. A
-diagnosis weighs such samples down. A prediction takes of each what is nearest to a joint's recorded torque.
+diagnosis weighs such samples down. A prediction takes of each what is nearest to a joint's recorded torque; but
+bristles, which a single rest may speak for, only where they are nearer by more than the standard error from
+piece to piece of the recordings (Breiman et al., Classification and Regression Trees, 1984).
 """
 
 import dataclasses
@@ -21,6 +23,8 @@ TURNS = (Turn("speed", 0.01), *(Turn("distance", x) for x in (3e-4, 7e-4, 1.5e-3
 """How friction of a gear may turn [rad/s, rad]."""
 CUTOFFS = (40.0, 30.0, 24.0, 20.0, 17.0, 14.0, 12.0, 10.0, 8.5, 7.0, 6.0, 5.0)
 """Low-passes of the motion that are tried [Hz]."""
+PIECE = 2.0
+"""Of a recording, about as long as a motion between two rests [s]."""
 LONG = 120.0
 """What of a recording is compared, from its start, at most [s]: more says the same again."""
 MOST = 0.5
@@ -56,7 +60,15 @@ def _turns(
         return ()
     ways = (None, *TURNS)
     each = [dataclasses.replace(corrected, turns=(way,) * corrected.arm.dof) for way in ways]
-    nearest = np.argmin([_squares(moved, one) for one in each], 0)
+    pieces = np.stack([_pieces(moved, one) for one in each])
+    squares = pieces.sum(1)
+    nearest = squares.argmin(0)
+    further = pieces - np.take_along_axis(pieces, nearest[None, None], 0)
+    count = further.shape[1]
+    error = np.sqrt(count) * np.std(further, 1, ddof=1) if count > 1 else np.inf
+    # MuJoCo's and tanh, which remember nothing
+    plain = np.where(further.sum(1) <= error, squares, np.inf)[:2]
+    nearest = np.where(np.isfinite(plain).any(0), plain.argmin(0), nearest)
     others = nearest[rubs & judged]
     nearest[~np.asarray(judged)] = np.argmax(np.bincount(others)) if len(others) else 0
     return tuple(ways[k] for k in nearest) if any(nearest) else ()
@@ -124,9 +136,17 @@ def _beginning(moved: Trajectory) -> Trajectory:
 
 def _squares(moved: Sequence[Trajectory], corrected: Corrected) -> Float[np.ndarray, " dof"]:
     """Of the errors of predicted torque in all recordings, without gaps, in sum [N² m²]."""
-    out = np.zeros(corrected.arm.dof)
+    return _pieces(moved, corrected).sum(0)
+
+
+def _pieces(moved: Sequence[Trajectory], corrected: Corrected) -> Float[np.ndarray, "pieces dof"]:
+    """The same for each piece of the recordings."""
+    out = []
     for one in moved:
         trace, torque = predicted(one, corrected)
         assert trace.tau is not None
-        out += np.sum((trace.tau - torque)[trace.weight > 0] ** 2, 0)
-    return out
+        squares = (trace.tau - torque) ** 2 * (trace.weight > 0)[:, None]
+        time = trace.motion.time
+        count = max(round(float(time[-1] - time[0]) / PIECE), 1)
+        out += [piece.sum(0) for piece in np.array_split(squares, count)]
+    return np.array(out)

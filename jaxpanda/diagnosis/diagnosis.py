@@ -198,18 +198,20 @@ def sought(
     progress("refining the numbers, and weighing what else it could be")
     state = polished(problem, searched)
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
-    contradicted = premises.knowledge != knowledge  # an identification by a poorer motion is no finding
-    wrong = numbers(problem, state, premises.changes) if contradicted else []
+    guessed = premises.knowledge not in ("exact", "identified")
+    moved = numbers(problem, state, premises.changes) if guessed else []
+    # within what is known of them, or by an identification with a poorer motion, they are no finding
+    wrong = moved if (premises.knowledge, premises.scale) != (knowledge, 1.0) else []
     kept = transferable(problem, laws)
     if doubtful := stand_ins(problem, kept):
         kept = with_terms(problem, [t for t in kept.terms if all(t is not d for d in doubtful)])
-    background = premises.background if kept.terms or wrong else ()
+    background = premises.background if kept.terms or moved else ()
     lasting = [t for t, on in zip(premises.background, premises.lasting, strict=True) if background and on]
-    correct = lambda by: _corrected(arm, premises, lasting, by, refitted=bool(by.terms or wrong))
+    correct = lambda by: _corrected(arm, premises, lasting, by, refitted=bool(by.terms or moved))
     corrected = correct(kept)
-    moved = [trajectory(recording) for recording in recordings]
+    motions = [trajectory(recording) for recording in recordings]
     added = [*lasting, *kept.terms]
-    if worse := misleading(moved, corrected, len(added)):
+    if worse := misleading(motions, corrected, len(added)):
         gone = {id(added[i]) for i in worse}
         lasting = [t for t in lasting if id(t) not in gone]
         kept = with_terms(problem, [t for t in kept.terms if id(t) not in gone])
@@ -230,6 +232,8 @@ def sought(
             kept = with_terms(problem, ())
             corrected, fitted = correct(kept), fit(problem, kept)
         answer = verdict([f for f, on in zip(found, likely, strict=True) if on], fitted, more)
+    if moved and not wrong:
+        notes.append(_refitted(arm, moved, knowledge))
     left_out = [
         *(t for t, gone in zip(state.terms, lost, strict=True) if gone),
         *(t for t in background if all(t is not k for k in lasting)),
@@ -246,7 +250,7 @@ def sought(
             f"left out of the corrected model: the free curve at joint {where}, which leaves more than half of"
             " what it is fitted to where it was not fitted"
         )
-    corrected = as_recorded(moved, buildable(source, corrected, problem), _judged(problem))
+    corrected = as_recorded(motions, buildable(source, corrected, problem), _judged(problem))
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
     made = Diagnosis(
         verdict=answer,
@@ -272,8 +276,18 @@ def sought(
         kept=kept,
         scale=premises.scale,
     )
-    # numbers that only moved within what they were uncertain by stay as the user wrote them
-    return made, corrected if wrong else corrected.as_written
+    # numbers that moved by less than torque shows stay as the user wrote them
+    return made, corrected if moved else corrected.as_written
+
+
+def _refitted(arm: Arm, moved: Sequence[Finding], knowledge: knowledge_.Knowledge) -> str:
+    """A sentence about numbers of the model that are no finding."""
+    each = []
+    for f in moved:
+        j = int(np.argmax(f.rms_torque))
+        size = f"{f.rms_torque[j]:.3g} {arm.unit('N·m', j)} rms"
+        each.append(f"{f.effect.replace('_', ' ')}, by up to {size} at joint {j + 1}")
+    return f"numbers of the model were refitted as “{knowledge}” allows: {'; '.join(each)}"
 
 
 def _too_unsure(findings: Sequence[Finding]) -> str:
