@@ -28,6 +28,8 @@ def knows(flag: str) -> bool:
 
 
 # Before JAX is imported; workers and subprocesses find it in their environment.
+for library in ("OPENBLAS", "OMP", "MKL"):
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")  # those of one worker would wait for another's
 if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = " ".join(f"--{k}={v}" for k, v in QUICK_TO_COMPILE.items() if knows(k))
 

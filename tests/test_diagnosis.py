@@ -66,7 +66,7 @@ def found():
 def test_nothing_is_reported_when_nothing_is_missing():
     result = diagnose(None, [record(2), record(3)])
     assert result.verdict == "consistent"
-    assert result.to_json()["findings"] == []
+    assert result.findings == ()
     np.testing.assert_allclose(result.fit.rmse_after, result.fit.rmse_before, rtol=0.02)
 
 

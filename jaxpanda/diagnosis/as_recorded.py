@@ -34,8 +34,9 @@ MOST = 0.5
 def as_recorded(whole: Sequence[Trajectory], corrected: Corrected, judged: Sequence[bool]) -> Corrected:
     """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings.
 
-    Of joints that were not `judged` their own torque tells nothing: friction at rest may have carried any load.
-    They are taken to be as most others are.
+    Of joints that were not `judged` their own torque tells nothing of friction, which may have carried any load
+    at rest. Theirs is taken to turn as that of most others does; so is fast motion in their torque, unless that
+    shows little of it itself.
     """
     moved = [_beginning(one) for one in whole]
     best = dataclasses.replace(corrected, turns=_turns(moved, corrected, judged))
@@ -45,7 +46,7 @@ def as_recorded(whole: Sequence[Trajectory], corrected: Corrected, judged: Seque
     filtered = np.min(slower, 0) < MOST * _squares(moved, best)
     cutoffs = np.where(filtered, np.array(CUTOFFS)[np.argmin(slower, 0)], np.inf)
     known = np.sort(cutoffs[np.asarray(judged)])
-    cutoffs[~np.asarray(judged)] = known[len(known) // 2] if len(known) else np.inf
+    cutoffs[~np.asarray(judged) & ~filtered] = known[len(known) // 2] if len(known) else np.inf
     recorded = Recorded.of([one.recording for one in whole])
     below = tuple(float(cutoff) if np.isfinite(cutoff) else None for cutoff in cutoffs)
     return dataclasses.replace(best, cutoffs=below if any(below) else (), recorded=recorded)

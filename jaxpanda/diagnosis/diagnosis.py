@@ -30,6 +30,7 @@ from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import VERDICTS, Finding, Fit
 from .friction_shown import friction_shown
+from .host import on_host
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .posterior import posterior_of
@@ -116,6 +117,7 @@ class Diagnosis:
         """For each recording the errors [N m] of a fit to other blocks, and which samples count."""
         return held_out(self.problem, self.state)
 
+    @on_host
     def to_json(self) -> dict[str, Any]:
         """diagnosis.json."""
         return {
