@@ -54,31 +54,15 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(seconds)
 
 
+# fmt: off
 LONGEST = (
-    *(
-        "real_arms",
-        "diagnosis",
-        "decide",
-        "commands",
-        "feasible",
-        "batched",
-        "ensemble",
-        "readme_chain",
-        "demo",
-    ),
-    *("retrieval", "validation", "comparison", "fleet", "next_motion", "discrepancy", "dynamics", "rollout"),
-    *(
-        "excitation",
-        "own_effects",
-        "resting",
-        "effects",
-        "hostile",
-        "scale",
-        "known",
-        "localise",
-        "derivatives",
-    ),
+    "real_arms", "two_sided", "diagnosis", "uncertainty", "discrepancy", "decide", "batched",
+    "derivatives", "identification", "commands", "feasible", "meaning", "fleet", "scale", "noise",
+    "readme_chain", "ensemble", "demo", "premises", "localise", "ranks", "simulation", "rollout",
+    "validation", "comparison", "excitation", "own_effects", "resting", "effects", "hostile",
+    "next_motion", "retrieval", "dynamics",
 )
+# fmt: on
 """Files that take long, the longest first: one that begins when the others end is waited for."""
 
 
