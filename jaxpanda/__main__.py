@@ -257,7 +257,8 @@ class Diagnose:
     reference: tuple[Path, ...] = ()
     """Recordings of the same arm from when nothing was wrong."""
     knowledge: Literal["exact", "identified", "rough", "unknown"] = "identified"
-    """How well the numbers in the model are known."""
+    """How well the numbers in the model are known: as they are, by an identification, as a data sheet has them,
+    or not at all."""
     read: _Read = dataclasses.field(default_factory=Reading)
     convention: _Convention = PLAIN
     part: _Part = WHOLE

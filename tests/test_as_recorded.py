@@ -84,15 +84,8 @@ def test_bristles_that_one_moment_shows_and_the_rest_of_a_recording_does_not_are
     moved = [trajectory(dataclasses.replace(still, tau=tau + NOISE * rng.normal(size=q.shape)))]
     zeros = jnp.zeros(7)
     corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
-    error = [
-        np.std(
-            predicted(moved[0], dataclasses.replace(corrected, turns=(None, None, turn) + (None,) * 4))[1][
-                :, 2
-            ]
-            - tau[:, 2]
-        )
-        for turn in (SPEED, BRISTLES)
-    ]
+    turning = lambda turn: dataclasses.replace(corrected, turns=(None, None, turn, *[None] * 4))
+    error = [np.std((predicted(moved[0], turning(turn))[1] - tau)[:, 2]) for turn in (SPEED, BRISTLES)]
     assert error[1] < 0.9 * error[0]
     assert as_recorded(moved, corrected, JUDGED).turns[2] == SPEED
 
