@@ -136,7 +136,8 @@ def numbers(
                 rms_torque=np.sqrt(felt),
                 evidence=float(0.5 * len(weights) * np.sum(felt / state.noise.std**2)),
                 summary=f"The simulation's own numbers are not this arm's ({name.replace('_', ' ')}): refitted"
-                f" together they explain {np.sqrt(felt[strongest]):.3g} N·m rms at joint {strongest + 1}."
+                f" together they explain {np.sqrt(felt[strongest]):.3g}"
+                f" {problem.arm.unit('N·m', strongest)} rms at joint {strongest + 1}."
                 " Torque sensors of a wrong scale could look alike.",
                 terms=(),
             )

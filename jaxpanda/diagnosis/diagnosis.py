@@ -286,7 +286,7 @@ def _refitted(arm: Arm, moved: Sequence[Finding], knowledge: knowledge_.Knowledg
     """A sentence about numbers of the model that are no finding."""
     each = []
     for f in moved:
-        j = int(np.argmax(f.rms_torque))
+        j = max(f.joints, key=lambda j: f.rms_torque[j])
         size = f"{f.rms_torque[j]:.3g} {arm.unit('N·m', j)} rms"
         each.append(f"{f.effect.replace('_', ' ')}, by up to {size} at joint {j + 1}")
     return f"numbers of the model were refitted as “{knowledge}” allows: {'; '.join(each)}"
