@@ -1,24 +1,77 @@
-"""Systems with many symmetric positive definite matrices, a batch at a time: by the library on a processor, by
-blocks on a GPU.
+"""Systems with many symmetric positive definite matrices, a batch at a time: by the library on a processor; on a
+GPU a thread each (`threads`) or, where there are too few to keep it busy, by blocks.
 
 A GPU's library factors matrices of an arm's size, and solves with one right-hand side, one after the other within
 a thread block; a few products of their blocks for all matrices at once take half as long.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from . import threads
+
+MANY = 16384
+"""Matrices from which on a thread each takes less time than blocks do."""
 _BLOCK = 14
+
+
+class Summed(NamedTuple):
+    r"""Matrices $C + w\,aa^\top + \sum_k r_k r_k^\top + D$ and blocks on the diagonal, from the first row on."""
+
+    constant: Float[Array, "n n"]
+    """C"""
+    common: Float[Array, " n"]
+    """a"""
+    weight: Float[Array, " lanes"]
+    """w"""
+    blocks: Float[Array, "blocks size size lanes"]
+    rows: Float[Array, "rows n lanes"]
+    """r"""
+    diagonal: Float[Array, "n lanes"]
+    """D"""
 
 
 def factor(H: Float[Array, "lanes n n"]) -> Float[Array, "lanes n n"]:
     """What `solve` needs of H; not a number where H is not positive definite."""
+    if len(H) >= MANY:
+        by_threads = lambda H: jnp.moveaxis(threads.factor(jnp.moveaxis(H, 0, -1)), -1, 0)
+        return jax.lax.platform_dependent(H, cpu=cholesky, cuda=by_threads, default=by_blocks)
     return jax.lax.platform_dependent(H, cpu=cholesky, default=by_blocks)
+
+
+def factor_of_sum(H: Summed) -> Float[Array, "lanes n n"]:
+    """The same of matrices that need not be written down where each thread has its own."""
+    if len(H.weight) >= MANY:
+        by_threads = lambda *parts: jnp.moveaxis(threads.factor_of_sum(*parts), -1, 0)
+        cpu, default = (lambda *parts, f=f: f(dense(Summed(*parts))) for f in (cholesky, by_blocks))
+        return jax.lax.platform_dependent(*H, cpu=cpu, cuda=by_threads, default=default)
+    return factor(dense(H))
+
+
+def dense(H: Summed) -> Float[Array, "lanes n n"]:
+    """Lanes first, as the library wants them."""
+    count, size, _, lanes = H.blocks.shape
+    n, columns = count * size, len(H.constant)
+    blocks = jax.lax.optimization_barrier(jnp.moveaxis(H.blocks, -1, 0))
+    spread = (blocks[:, :, :, None] * jnp.eye(count)[:, None, :, None]).reshape(lanes, n, n)
+    if columns > n:
+        spread = jnp.pad(spread, ((0, 0), (0, columns - n), (0, columns - n)))
+    found = H.constant + spread + H.weight[:, None, None] * (H.common[:, None] * H.common)
+    if len(H.rows):
+        found = found + jnp.einsum("kpb,kqb->bpq", H.rows, H.rows)
+    return found + H.diagonal.T[:, :, None] * jnp.eye(columns)
 
 
 def solve(factor: Float[Array, "lanes n n"], rhs: Float[Array, "lanes n"]) -> Float[Array, "lanes n"]:
     """$H^{-1}$ rhs."""
+    if len(rhs) >= MANY:
+        by_threads = lambda F, rhs: threads.solve(jnp.moveaxis(F, 0, -1), rhs.T).T
+        return jax.lax.platform_dependent(
+            factor, rhs, cpu=substitute, cuda=by_threads, default=substitute_by_blocks
+        )
     return jax.lax.platform_dependent(factor, rhs, cpu=substitute, default=substitute_by_blocks)
 
 

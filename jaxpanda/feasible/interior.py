@@ -243,27 +243,21 @@ def of_link_boxes(problem: Problem, ratio: Float[Array, "linear lanes"]) -> Floa
     return jnp.einsum("lcqr,lcb->lqrb", squares, ratio[:first].reshape(dof, PER_LINK, -1))
 
 
-def _assemble(problem: Problem, blocks, rows, ratio, damping) -> Float[Array, "lanes columns columns"]:
-    """The step's matrix: lanes first, as the library's Cholesky wants them."""
-    n, dof, first = 10 * problem.dof, problem.dof, PER_LINK * problem.dof
-    lanes, columns = ratio.shape[1], len(problem.Q)
-    blocks = blocks + of_link_boxes(problem, ratio)
-    blocks = jax.lax.optimization_barrier(jnp.moveaxis(blocks, -1, 0))
-    spread = (blocks[:, :, :, None] * jnp.eye(dof)[:, None, :, None]).reshape(lanes, n, n)
-    diagonal = jnp.broadcast_to(damping[:, None], (lanes, columns))
+def _assemble(problem: Problem, blocks, rows, ratio, damping) -> definite.Summed:
+    """The step's matrix."""
+    n, first, columns = 10 * problem.dof, PER_LINK * problem.dof, len(problem.Q)
+    diagonal = jnp.broadcast_to(damping, (columns, len(damping)))
     if columns > n:
-        spread = jnp.pad(spread, ((0, 0), (0, columns - n), (0, columns - n)))
-        diagonal = diagonal + ratio[first + 2 :].T @ problem.G[first + 2 :] ** 2
-    low, high = problem.G[first], problem.G[first + 1]
-    H = problem.Q + spread
-    H = (
-        H
-        + ratio[first][:, None, None] * (low[:, None] * low)
-        + ratio[first + 1][:, None, None] * (high[:, None] * high)
+        diagonal = diagonal.at[n:].add((problem.G[first + 2 :, n:] ** 2).T @ ratio[first + 2 :])
+    total = problem.G[first : first + 2]  # the same row with either sign, or zero
+    return definite.Summed(
+        constant=problem.Q,
+        common=jnp.max(jnp.abs(total), 0),
+        weight=jnp.where(jnp.any(total != 0, 1), 1.0, 0.0) @ ratio[first : first + 2],
+        blocks=blocks + of_link_boxes(problem, ratio),
+        rows=rows,
+        diagonal=diagonal,
     )
-    if len(rows):
-        H = H + jnp.einsum("kpb,kqb->bpq", rows, rows)
-    return H + diagonal[:, :, None] * jnp.eye(columns)
 
 
 def barrier(
@@ -330,7 +324,7 @@ def step(problem: Problem, state: State, most: int) -> State:
     # The next target is not known yet; a tenth of mu is about right.
     nearness = 0.1 * _NEARNESS * mu
     H = _assemble(problem, blocks, rows, state.z / s, state.damping + nearness)
-    factor = definite.factor(H)
+    factor = definite.factor_of_sum(H)
     solve = lambda rhs: definite.solve(factor, rhs.T).T
     nothing_left = MET * jnp.sum(problem.b**2)
     solved = state.tolerance * value.objective + nothing_left

@@ -62,7 +62,7 @@ def origin_of(start: convex.Origin) -> Origin | None:
     return Origin(start, jnp.asarray(right[rank:].T), jnp.asarray(lift))
 
 
-def solve_starts(origin: Origin, numbers: Int[Array, " chunk"], lanes: int) -> Outcome:
+def solve_starts(origin: Origin, numbers: Int[Array, " chunk"], lanes: tuple[int, ...]) -> Outcome:
     """Every start's projection; converged where that has the coefficients and violates nothing."""
     problem = origin.start.problem
     x0 = jax.vmap(lambda number: convex.start(origin.start, number))(numbers)

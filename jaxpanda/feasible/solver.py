@@ -43,7 +43,7 @@ class _Way(NamedTuple):
 
     solve_starts: schedule.Chunk
     origin: Any
-    options: tuple[int, ...]
+    options: tuple[Any, ...]
     chunk: int
 
 
@@ -241,11 +241,9 @@ def _solve(
 
     def along_the_path() -> _Way:
         problem = convex.scaled_problem(A, b, bounds, *further, constraints, carried)
-        kind = "cpu" if device.platform == "cpu" else "gpu"
-        options = rounds * iterations, convex.LANES[kind]
-        return _Way(
-            convex.solve_starts, convex.origin_of(problem, seed, initial), options, convex.CHUNK[kind]
-        )
+        size, lanes = convex.sizes(device.platform, starts)
+        origin = convex.origin_of(problem, seed, initial)
+        return _Way(convex.solve_starts, origin, (rounds * iterations, lanes), size)
 
     def by_newton() -> _Way:
         held = constraints if carried is None else (*constraints, less_lumped(carried))

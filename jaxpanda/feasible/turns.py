@@ -1,6 +1,7 @@
 """Many lanes that take steps, some of them at a time, until all are done."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import equinox as eqx
@@ -22,17 +23,22 @@ class AbstractSteps(eqx.Module):
 _State = TypeVar("_State", bound=AbstractSteps)
 
 
-def in_turns(step: Callable[[_State], _State], state: _State, most: int, lanes: int) -> _State:
+def in_turns(step: Callable[[_State], _State], state: _State, most: int, lanes: Sequence[int]) -> _State:
     """Let so many lanes at a time take a few steps, those that have taken the fewest first.
 
     Until all are done or have taken the most: what is done costs nothing more, and no lane waits for the slowest.
+    Where several numbers are given, fewer take part from when no more than so many are left.
     """
     left = lambda state: ~state.done & (state.steps < most)
 
-    def go_on(state: _State) -> _State:
-        chosen = jnp.argsort(jnp.where(left(state), state.steps, most + 1))[: min(lanes, len(state.steps))]
+    def go_on(many: int, state: _State) -> _State:
+        chosen = jnp.argsort(jnp.where(left(state), state.steps, most + 1))[: min(many, len(state.steps))]
         part = jax.tree.map(lambda leaf: leaf[..., chosen], state)
         part = jax.lax.fori_loop(0, _SEGMENT, lambda _, part: step(part), part)
         return jax.tree.map(lambda whole, new: whole.at[..., chosen].set(new), state, part)
 
-    return jax.lax.while_loop(lambda state: jnp.any(left(state)), go_on, state)
+    for many, few in zip(lanes, (*lanes[1:], 0), strict=True):
+        state = jax.lax.while_loop(
+            lambda state, few=few: jnp.sum(left(state)) > few, functools.partial(go_on, many), state
+        )
+    return state
