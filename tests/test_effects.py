@@ -249,6 +249,17 @@ def test_an_encoder_offset_is_the_change_of_torque_to_first_order(arm, motion):
     )
 
 
+def test_a_sensor_that_is_linearised_has_a_plausible_error_within_what_it_is_linearised_over(arm):
+    """Without, a real arm's last joint had an offset of 53 rad, for a part of what it carries."""
+    linearised = [e for c in CATALOGUE if c.family in ("sensor", "clock") for e in c.grid(arm)]
+    linearised = [e for e in linearised if any(shape.pivot for shape in e.shapes)]
+    assert {e.name for e in linearised} == {"encoder_offset", "time_delay"}
+    for effect in linearised:
+        (shape,) = (shape for shape in effect.shapes if shape.pivot)
+        assert effect.coefficients[0].scale is not None
+        assert 0 < effect.coefficients[0].scale < shape.upper
+
+
 def test_an_encoder_offset_of_a_vertical_first_joint_does_not_show(motion):
     assert np.abs(EncoderOffset(0, 0.1).over(motion)).max() < 1e-9
 

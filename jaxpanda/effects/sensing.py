@@ -239,7 +239,7 @@ class EncoderOffset(AbstractArmEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("offset", "rad"),)
+        return (Coefficient("offset", "rad", scale=0.1),)
 
     @property
     def equation(self) -> str:
