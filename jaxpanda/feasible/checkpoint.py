@@ -121,7 +121,7 @@ def identity(
     constraints: Sequence[Constraint],
     extra: tuple[np.ndarray | None, ...],
     seed: int,
-    settings: tuple[float | int, ...],
+    settings: tuple[int | tuple[int, ...], ...],
 ) -> dict[str, str]:
     """What a start's outcome depends on, by name: the numbers as digests, programs by their source."""
     here = Path(__file__).parent
