@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from . import threads
 
-MANY = 16384
+_MANY = 16384
 """Matrices from which on a thread each takes less time than blocks do."""
 _BLOCK = 14
 
@@ -36,7 +36,7 @@ class Summed(NamedTuple):
 
 def factor(H: Float[Array, "lanes n n"]) -> Float[Array, "lanes n n"]:
     """What `solve` needs of H; not a number where H is not positive definite."""
-    if len(H) >= MANY:
+    if len(H) >= _MANY:
         by_threads = lambda H: jnp.moveaxis(threads.factor(jnp.moveaxis(H, 0, -1)), -1, 0)
         return jax.lax.platform_dependent(H, cpu=cholesky, cuda=by_threads, default=by_blocks)
     return jax.lax.platform_dependent(H, cpu=cholesky, default=by_blocks)
@@ -44,7 +44,7 @@ def factor(H: Float[Array, "lanes n n"]) -> Float[Array, "lanes n n"]:
 
 def factor_of_sum(H: Summed) -> Float[Array, "lanes n n"]:
     """The same of matrices that need not be written down where each thread has its own."""
-    if len(H.weight) >= MANY:
+    if len(H.weight) >= _MANY:
         by_threads = lambda *parts: jnp.moveaxis(threads.factor_of_sum(*parts), -1, 0)
         cpu, default = (lambda *parts, f=f: f(dense(Summed(*parts))) for f in (cholesky, by_blocks))
         return jax.lax.platform_dependent(*H, cpu=cpu, cuda=by_threads, default=default)
@@ -67,7 +67,7 @@ def dense(H: Summed) -> Float[Array, "lanes n n"]:
 
 def solve(factor: Float[Array, "lanes n n"], rhs: Float[Array, "lanes n"]) -> Float[Array, "lanes n"]:
     """$H^{-1}$ rhs."""
-    if len(rhs) >= MANY:
+    if len(rhs) >= _MANY:
         by_threads = lambda F, rhs: threads.solve(jnp.moveaxis(F, 0, -1), rhs.T).T
         return jax.lax.platform_dependent(
             factor, rhs, cpu=substitute, cuda=by_threads, default=substitute_by_blocks

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 _BLOCK = 5
-"""Rows of a block. Of 7, a factor takes a tenth less time, and 45 s to compile in place of 6."""
+"""Rows of a block. With 7, a factor takes a little less time, and many times as long to compile."""
 _THREADS = 32
 """Of a group."""
 _LOWER = [(r, s) for r in range(_BLOCK) for s in range(r + 1)]
@@ -28,7 +28,9 @@ def factor(H: Float[Array, "n n lanes"], interpret: bool = False) -> Float[Array
         H: symmetric; its lower triangle is read.
         interpret: run it without a GPU, slowly.
     """
-    return _call(_factor, interpret, H)
+    n, _, lanes = H.shape
+    filled = _with_unit(H)
+    return _launched(_factor, filled.shape, interpret, filled)[:n, :n, :lanes]
 
 
 def factor_of_sum(
@@ -41,35 +43,47 @@ def factor_of_sum(
     interpret: bool = False,
 ) -> Float[Array, "n n lanes"]:
     """The same of `definite.Summed`, of which H is never written down."""
-    missing, lanes = -len(common) % _BLOCK, len(weight)
-    more = -lanes % _THREADS
-    one = (0, missing)
-    constant = jnp.pad(constant, (one, one)) + jnp.diag(jnp.arange(len(common) + missing) >= len(common))
+    n, lanes = diagonal.shape
+    size, all_lanes = whole = _whole_blocks(n, lanes)
     parts = [
-        constant,
-        jnp.pad(common, one),
-        jnp.pad(weight, (0, more)),
-        jnp.pad(blocks, ((0, 0), (0, 0), (0, 0), (0, more))),
-        *jnp.pad(rows, ((0, 0), one, (0, more))),
-        jnp.pad(diagonal, (one, (0, more))),
+        _filled(constant, size, size) + _unit_beyond(n, size),
+        _filled(common, size),
+        _filled(weight, all_lanes),
+        _filled(blocks, *blocks.shape[:3], all_lanes),
+        *_filled(rows, len(rows), *whole),
+        _filled(diagonal, *whole),
     ]
-    shape = (*constant.shape, lanes + more)
-    found = _launched(_factor_of_sum, shape, interpret, *parts)
-    return found[: len(common), : len(common), :lanes]
+    return _launched(_factor_of_sum, (size, size, all_lanes), interpret, *parts)[:n, :n, :lanes]
 
 
 def solve(
     factor: Float[Array, "n n lanes"], rhs: Float[Array, "n lanes"], interpret: bool = False
 ) -> Float[Array, "n lanes"]:
     """$H^{-1}$ rhs."""
-    return _call(_solve, interpret, factor, rhs)
+    n, lanes = rhs.shape
+    whole = _whole_blocks(n, lanes)
+    return _launched(_solve, whole, interpret, _with_unit(factor), _filled(rhs, *whole))[:n, :lanes]
 
 
-def _call(kernel: Any, interpret: bool, *arrays: Array) -> Array:
-    """The last of the arrays says the result's shape."""
-    filled = [_filled(x) for x in arrays]
-    found = _launched(kernel, filled[-1].shape, interpret, *filled)
-    return found[tuple(slice(size) for size in arrays[-1].shape)]
+def _whole_blocks(n: int, lanes: int) -> tuple[int, int]:
+    """Rows and lanes up to whole blocks and groups."""
+    return n + -n % _BLOCK, lanes + -lanes % _THREADS
+
+
+def _filled(x: Array, *shape: int) -> Array:
+    return jnp.pad(x, [(0, whole - own) for own, whole in zip(x.shape, shape, strict=True)])
+
+
+def _with_unit(H: Float[Array, "n n lanes"]) -> Float[Array, "rows rows all"]:
+    n, _, lanes = H.shape
+    rows, all_lanes = _whole_blocks(n, lanes)
+    filled = _filled(H, rows, rows, all_lanes)
+    return filled if rows == n else filled + _unit_beyond(n, rows)[..., None]
+
+
+def _unit_beyond(n: int, rows: int) -> Float[Array, "rows rows"]:
+    """Of the rows that only fill a block: a unit matrix, which leaves the others alone."""
+    return jnp.diag(jnp.arange(rows) >= n).astype(float)
 
 
 def _launched(kernel: Any, shape: tuple[int, ...], interpret: bool, *arrays: Array) -> Array:
@@ -83,17 +97,6 @@ def _launched(kernel: Any, shape: tuple[int, ...], interpret: bool, *arrays: Arr
         compiler_params=triton.CompilerParams(num_warps=_THREADS // 32),
         interpret=interpret,
     )(*arrays)
-
-
-def _filled(x: Array) -> Array:
-    """With more rows and lanes, up to whole blocks and groups; a matrix with a unit matrix."""
-    *rows, lanes = x.shape
-    missing = -rows[0] % _BLOCK
-    if not missing and not lanes % _THREADS:
-        return x
-    x = jnp.pad(x, (*((0, missing) for _ in rows), (0, -lanes % _THREADS)))
-    last = jnp.arange(rows[0], rows[0] + missing)
-    return x if len(rows) == 1 else x.at[last, last].set(1.0)
 
 
 Axis = Any
