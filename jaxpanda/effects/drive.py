@@ -15,7 +15,7 @@ from ..arms.arm import Arm
 from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Numbers, Shape
 from .friction import CORRECTED
 from .motion import Channels, Joint, Motion
-from .twist import Law, low_passed, twist_torque
+from .twist import Law, held_up, low_passed, twist_torque
 
 
 class Armature(AbstractInstantEffect):
@@ -237,7 +237,7 @@ class JointElasticity(AbstractArmEffect):
 
     In form "smooth" the torque that twists is low-passed: the link above its resonance would otherwise take the
     noise of q, differentiated twice, out of the residual that is made of it. Form "whole", without, is tried
-    where there is evidence of the smooth one.
+    where there is evidence of the smooth one. What is too soft to hold the link up is taken for as stiff as does.
 
     References:
         Spong, ASME JDSMC 1987; Madsen et al., Math. Probl. Eng. 2020; Tuttle, MIT AI-TR 1365, 1992.
@@ -306,7 +306,7 @@ class JointElasticity(AbstractArmEffect):
         laws = [
             Law(
                 int(e.joint),
-                float(e.stiffness),
+                held_up(float(e.stiffness), int(e.joint), motion),
                 float(e.damping_ratio),
                 stiffening=float(e.stiffening),
                 cutoff=_TWIST_CUTOFF if e.form == "smooth" else np.inf,
@@ -351,7 +351,8 @@ class Backlash(AbstractArmEffect):
     Forms "smooth" and "whole" are those of an elastic joint. It is for a position sensor on the motor's side. On
     the link's side the gap does not show in the torque on that side, and motor torque shows it only as the
     motor's own inertia and friction. Where the load never changes sign this is an encoder offset and an elastic
-    gear; stops softer than a gear's would be one without a gap.
+    gear; stops softer than a gear's would be one without a gap, and what is too soft to hold the link up is taken
+    for as stiff as does.
 
     References:
         Nordin and Gutman, Automatica 2002.
@@ -412,7 +413,7 @@ class Backlash(AbstractArmEffect):
         laws = [
             Law(
                 int(e.joint),
-                float(e.stop_stiffness),
+                held_up(float(e.stop_stiffness), int(e.joint), motion),
                 float(e.damping_ratio),
                 half_width=float(e.half_width),
                 cutoff=_TWIST_CUTOFF if e.form == "smooth" else np.inf,

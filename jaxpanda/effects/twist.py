@@ -55,6 +55,12 @@ class Law:
     """Low-pass of the torque that twists [Hz]."""
 
 
+def held_up(stiffness: float, joint: int, motion: Motion) -> float:
+    r"""A stiffness [N m/rad], or what keeps gravity from turning the link over: twice
+    $-\partial\tau_j/\partial q_j$, at which it would not come to rest."""
+    return max(stiffness, -2.0 * float(motion.slope[:, joint].min()))
+
+
 def twist_torque(motion: Motion, laws: Sequence[Law]) -> Float[np.ndarray, "time dof m"]:
     """What each law adds to the torque of the rigid arm in all joints [N m]."""
     steps = max(1, int(np.ceil(motion.dt / _STEP - 1e-9)))
