@@ -19,13 +19,13 @@ from jaxpanda.errors import InputError
 from jaxpanda.excitation import excite
 from jaxpanda.excitation.design import Fourier, Problem, Task, starts
 from jaxpanda.excitation.excite import precision_of, verify
-from jaxpanda.excitation.limits import is_franka_panda, limits_of
-from jaxpanda.excitation.scene import probes_of, scene_of
 from jaxpanda.files import write_json
 from jaxpanda.identification import identify
 from jaxpanda.parameters import arm_base_parameters
 from jaxpanda.recordings import load, save
 from jaxpanda.simulation import FourierTrajectory, JointFriction, Sensors, random_trajectory, simulate
+from jaxpanda.workspace.limits import is_franka_panda, limits_of
+from jaxpanda.workspace.scene import probes_of, scene_of
 
 ARM = """<mujoco model="three">
   <compiler angle="radian"/>

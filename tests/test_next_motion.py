@@ -4,6 +4,7 @@ The arm is moved by MuJoCo's C engine, which shares no code with the analysis.
 """
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ import scipy.interpolate
 
 from jaxpanda import Arm, Recording
 from jaxpanda.arms.export import panda_mjcf
+from jaxpanda.arms.markup import parse
+from jaxpanda.arms.source import from_document
 from jaxpanda.diagnosis.coverage import held_out_gains, least_shown
 from jaxpanda.diagnosis.finding import Finding
-from jaxpanda.diagnosis.next_motion import motions, next_motion
+from jaxpanda.diagnosis.motions import Surroundings, motions
+from jaxpanda.diagnosis.next_motion import NOTHING, next_motion
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.proposals import grids
@@ -22,9 +26,11 @@ from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects.friction import ViscousFriction
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.simulation import FourierTrajectory, JointFriction, Sensors, random_trajectory, simulate
+from jaxpanda.workspace.scene import CLEARANCE, reach_of, scene_of
 
 JOINT, OFFSET = 5, 0.03
 SENSORS = Sensors(torque_noise=0.05, position_noise=1e-6)
+SOURCE = from_document(parse(panda_mjcf(), "mujoco", Path("panda.xml")))[1]
 
 
 class Spline(FourierTrajectory):
@@ -101,7 +107,7 @@ def margin(*recordings: Recording) -> float:
 @pytest.mark.slow
 def test_the_recommended_motion_separates_what_the_recorded_one_does_not(known, recorded):
     problem, spread, state, finding = known
-    motion = next_motion(problem, state, [finding], spread, "exact")
+    motion = next_motion(problem, state, [finding], spread, "exact", SOURCE)
     assert motion is not None
     (told,) = motion.pairs
     assert told.nats > 2 * told.nats_repeated
@@ -117,7 +123,7 @@ def test_motions_keep_to_limits_and_speeds_and_end_at_rest(known):
     problem = known[0]
     arm, trace = Arm.panda(), problem.traces[0]
     fastest = 1.1 * np.abs(trace.motion.qd).max(0)
-    for kind, q in motions(problem, trace, [JOINT])[1:]:
+    for kind, q in motions(problem, trace, [JOINT], Surroundings.around(problem, SOURCE))[1:]:
         assert len(q) == len(trace.channels.t)
         qd = np.gradient(q, trace.dt, axis=0)
         assert (q >= np.asarray(arm.lower)).all(), kind
@@ -126,19 +132,61 @@ def test_motions_keep_to_limits_and_speeds_and_end_at_rest(known):
         assert np.abs(qd[[0, -1]]).max() < 0.05, kind
 
 
+def test_motions_keep_clear_of_what_the_file_holds(known):
+    """A floor just below the recorded motion, as MuJoCo has it at every sample."""
+    problem = known[0]
+    floor = '<worldbody><geom type="plane" size="0 0 1" pos="0 0 {}" contype="1" conaffinity="1"/>'
+    arm, trace = Arm.panda(), problem.traces[0]
+
+    def of_file(height):
+        text = panda_mjcf().replace("<worldbody>", floor.format(height), 1)
+        return from_document(parse(text, "mujoco", Path("panda.xml")))[1]
+
+    def closest(source, q):
+        q, dt = q[::10], 10 * trace.dt
+        speed = 2 * float(np.abs(np.gradient(q, dt, axis=0)).sum(1).max()) * reach_of(arm)
+        return scene_of(arm, source, CLEARANCE, None).closest(np.arange(len(q)) * dt, q, speed).distance
+
+    recorded = np.asarray(trace.channels.q)
+    low, high = -1.0, 1.5
+    while high - low > 0.01:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if closest(of_file(middle), recorded) > 0.02 else (low, middle)
+    source = of_file(low)
+    kept = closest(source, recorded)
+    assert 0.02 < kept < 0.03
+    free = dataclasses.replace(Surroundings.around(problem, source), are_clear=lambda q: True)
+    assert min(closest(source, q) for _, q in motions(problem, trace, [JOINT], free)) < kept - 0.01
+    for kind, q in motions(problem, trace, [JOINT], Surroundings.around(problem, source)):
+        assert closest(source, q) > kept - 0.01, kind
+        assert np.ptp(q, axis=0).max() > 0.1, kind
+
+
+def test_what_is_in_doubt_without_a_rival_is_looked_for_again(known):
+    problem, spread, state, finding = known
+    doubted = dataclasses.replace(finding, confidence=0.4, alternatives=())
+    motion = next_motion(problem, state, [doubted], spread, "exact", SOURCE)
+    assert motion is not None
+    (told,) = motion.pairs
+    assert told.rival == NOTHING
+    assert told.nats >= told.nats_repeated > 0
+    believed = dataclasses.replace(finding, confidence=0.95, alternatives=())
+    assert next_motion(problem, state, [believed], spread, "exact", SOURCE) is None
+
+
 def test_nothing_is_recommended_where_nothing_is_in_doubt(known):
     problem, spread, state, finding = known
-    sure = dataclasses.replace(finding, alternatives=(("asymmetric_friction", 0.01),))
-    assert next_motion(problem, state, [sure], spread, "exact") is None
+    sure = dataclasses.replace(finding, confidence=0.95, alternatives=(("asymmetric_friction", 0.01),))
+    assert next_motion(problem, state, [sure], spread, "exact", SOURCE) is None
 
 
 def test_a_rival_that_no_motion_rules_out_is_not_decided(known):
     """A spring may be as soft as it likes, and is an offset then."""
     problem, spread, state, finding = known
     either = dataclasses.replace(finding, alternatives=(("joint_spring", 0.4),))
-    assert next_motion(problem, state, [either], spread, "exact") is None
+    assert next_motion(problem, state, [either], spread, "exact", SOURCE) is None
     both = dataclasses.replace(finding, alternatives=(("asymmetric_friction", 0.4), ("joint_spring", 0.4)))
-    motion = next_motion(problem, state, [both], spread, "exact")
+    motion = next_motion(problem, state, [both], spread, "exact", SOURCE)
     assert motion is not None
     assert [told.rival for told in motion.pairs] == ["asymmetric_friction"]
 

@@ -110,7 +110,7 @@ class Diagnosis:
     @functools.cached_property
     def next_motion(self) -> NextMotion | None:
         """The motion that would decide between a finding and its rivals; None where none is needed."""
-        return next_motion(self.problem, self.state, self.findings, self.spread, self.knowledge)
+        return next_motion(self.problem, self.state, self.findings, self.spread, self.knowledge, self.source)
 
     @functools.cached_property
     def held_out(self) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -8,30 +8,35 @@ that no shape of b, refitted together with the nuisance on old and new data, cou
 evidence for a that the motion is expected to bring [nats] (T-optimality, Atkinson and Fedorov 1975). Torque is
 not needed for that, only q(t). Either may be the true one, so both directions count, by their probabilities (Box
 and Hill 1967); of several rivals the one that is told least decides.
+
+A finding that is in doubt although no rival is likely may be none: what no law of the catalogue describes has
+passed for it. Then δ² is what the nuisance cannot imitate, and its evidence is $\tfrac12 n \log(1 + \delta^2/n)$
+with n independent samples, as in `state.foretelling`. W is that of the error where the model was not fitted.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.interpolate
-import scipy.ndimage
 from jaxtyping import Float
 
 from .. import files
+from ..arms.mjcf import MjcfSource
 from ..effects import AbstractEffect, AbstractJointEffect, Channels, Motion
-from .decide import coefficients
+from .decide import DOUBTFUL
 from .events import Proposal, ripple
 from .evidence import Noise
 from .finding import Finding
 from .host import parallel
 from .knowledge import Knowledge, nuisance
 from .library import columns_of
+from .motions import Surroundings, motions
 from .problem import Problem, Term, posed
 from .proposals import grids
-from .state import State
+from .state import State, coefficients, independent
 from .traces import TRIM, Trace, held_sign
 
 WORTH = 0.05
@@ -41,8 +46,8 @@ LEAST = 1.0
 _RIVALS, _FINALISTS = 3, 2
 _SHAPES = 16
 """Shapes of a rival that are tried in each of its forms, at most."""
-_DWELL = 0.5
-"""Rests between moves [s]."""
+NOTHING = "nothing"
+"""The rival of a finding that may be none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +78,8 @@ class NextMotion:
     tried: tuple[tuple[str, float], ...]
     """Every motion that was compared, and the evidence for the pair that it tells least, by rivals in the shape
     that fitted [nats]."""
+    said: str
+    """What it was kept clear of, in a sentence."""
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -81,6 +88,7 @@ class NextMotion:
             "seconds": float(self.time[-1] - self.time[0]),
             "pairs": [p.to_json() for p in self.pairs],
             "tried": [{"kind": kind, "nats": nats} for kind, nats in self.tried],
+            "collisions": self.said,
         }
 
     def save(self, path: str | Path) -> None:
@@ -117,14 +125,21 @@ class _Side:
 @dataclasses.dataclass(frozen=True)
 class _Pair:
     a: _Side
-    b: _Side
+    b: _Side | None
+    """None for nothing in its place."""
     others: tuple[Term, ...]
     share: float
     """Probability of a, of the two."""
+    doubt: float
+    """Product of their probabilities."""
+
+    @property
+    def rival(self) -> str:
+        return NOTHING if self.b is None else self.b.effect.name
 
     @property
     def alone(self) -> "_Pair":
-        return dataclasses.replace(self, a=self.a.alone, b=self.b.alone)
+        return dataclasses.replace(self, a=self.a.alone, b=None if self.b is None else self.b.alone)
 
 
 def next_motion(
@@ -133,23 +148,37 @@ def next_motion(
     found: Sequence[Finding],
     spread: Float[np.ndarray, "standard n"],
     knowledge: Knowledge,
+    source: MjcfSource,
 ) -> NextMotion | None:
-    """The motion that tells best what the findings are confused with; None where none is worth it or tells."""
-    pairs = [pair for finding in found for pair in _pairs(problem, state, finding)][:_RIVALS]
+    """The motion that tells best what the findings are confused with; None where none is worth it or tells.
+
+    Args:
+        problem: the recordings.
+        state: the model that was found.
+        found: the findings.
+        spread: of the inertial parameters.
+        knowledge: how well the model is known.
+        source: the arm's file, for what it could run into.
+    """
+    pairs = [pair for finding in found for pair in _pairs(problem, state, finding)]
+    pairs = sorted(pairs, key=lambda pair: -pair.doubt)[:_RIVALS]
     if not pairs:
         return None
     trace = max(problem.traces, key=lambda t: len(t.channels.t))
-    joints = sorted({j for p in pairs for e in (p.a.effect, p.b.effect) for j in e.joints[:1]})
-    kinds, ways = zip(*motions(problem, trace, joints), strict=True)
+    sides = [side for p in pairs for side in (p.a, p.b) if side is not None]
+    joints = sorted({j for side in sides for j in side.effect.joints[:1]})
+    surroundings = Surroundings.around(problem, source)
+    kinds, ways = zip(*motions(problem, trace, joints, surroundings), strict=True)
     new = _placed(trace, ways, spread, knowledge, problem.background)
-    quick = _told(problem, new, state.noise, [pair.alone for pair in pairs])
+    error = _Error.of(problem, state)
+    quick = _told(problem, new, error, [pair.alone for pair in pairs])
     decidable = [k for k in range(len(pairs)) if max(row[k] for row in quick) >= LEAST]
     if not decidable:
         return None
     pairs, quick = [pairs[k] for k in decidable], [[row[k] for k in decidable] for row in quick]
     best = sorted(range(1, len(new)), key=lambda i: -min(quick[i]))[:_FINALISTS]
     chosen = [0, *best]
-    told = _told(problem, [new[i] for i in chosen], state.noise, pairs)
+    told = _told(problem, [new[i] for i in chosen], error, pairs)
     results = [(kinds[i], ways[i], nats) for i, nats in zip(chosen, told, strict=True)]
     repeated = results[0][2]
     kind, q, told = max(results, key=lambda one: min(one[2]))
@@ -163,7 +192,7 @@ def next_motion(
         tuple(
             Told(
                 p.a.effect.name,
-                p.b.effect.name,
+                p.rival,
                 p.a.effect.joints[0] if len(p.a.effect.joints) == 1 else None,
                 float(t),
                 float(r),
@@ -171,22 +200,41 @@ def next_motion(
             for p, t, r in zip(pairs, told, repeated, strict=True)
         ),
         tuple((kind, float(min(t))) for kind, t in zip(kinds, quick, strict=True)),
+        surroundings.said,
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class _Error:
+    """What the model makes wrong where it was not fitted, as noise that another motion would have too."""
+
+    noise: Noise
+    independent: float
+    """Share of its samples that are independent, in the joint where most are."""
+
+    @classmethod
+    def of(cls, problem: Problem, state: State) -> "_Error":
+        noise, left = state.noise, problem.mispredicted(state.design, [state.noise])
+        count = np.maximum(np.count_nonzero(left, 0), 1)
+        more = np.maximum(np.sqrt(np.sum(left**2, 0) / count) / noise.std, 1.0)
+        wider = dataclasses.replace(noise, sigma=noise.sigma * more, std=noise.std * more)
+        return cls(wider, float(np.max(independent(left) / count)))
+
+
 def _told(
-    problem: Problem, new: Sequence[Problem], noise: Noise, pairs: Sequence[_Pair]
+    problem: Problem, new: Sequence[Problem], error: _Error, pairs: Sequence[_Pair]
 ) -> list[list[float]]:
     """For each motion and pair, the evidence that the motion is expected to bring [nats]."""
+    noise = error.noise
     old = [_pair_sums(problem, noise, pair) for pair in pairs]
-    known = [_discrimination(pair, sums) for pair, sums in zip(pairs, old, strict=True)]
+    known = [_discrimination(pair, sums, error) for pair, sums in zip(pairs, old, strict=True)]
 
     def told(one: Problem) -> list[float]:
         row = []
         for pair, before, already in zip(pairs, old, known, strict=True):
             more = _pair_sums(one, dataclasses.replace(noise, trust=None, stays=None), pair)
             together = [_added(x, y) for x, y in zip(before, more, strict=True)]
-            row.append(_discrimination(pair, together) - already)
+            row.append(_discrimination(pair, together, error) - already)
         return row
 
     return parallel(told, new)
@@ -195,12 +243,13 @@ def _told(
 def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
     """The finding against each rival that is worth an experiment."""
     rivals = {name: p for name, p in finding.alternatives if p >= WORTH}
+    none = 1.0 - finding.confidence - sum(p for _, p in finding.alternatives)
     if not finding.terms:
         return []
     i = max(finding.terms, key=lambda i: float(np.sum(state.terms[i].columns[0] ** 2)))
     term = state.terms[i]
     stands_in = finding.effect == "unknown" and term.effect.name != "unknown"
-    if not rivals or stands_in or term.effect.bound_to_recording:
+    if not (rivals or none >= DOUBTFUL) or stands_in or term.effect.bound_to_recording:
         return []
     others = (*state.terms[:i], *state.terms[i + 1 :])
     design = problem.design(others, state.noise)
@@ -214,12 +263,13 @@ def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
         if name in rivals and (name not in best or p.evidence > best[name].evidence):
             best[name] = p
     a = _Side(term.effect, coefficients(state, i), _shapes(problem, term.effect))
-    out = []
+    sure = finding.confidence
+    out = [_Pair(a, None, others, 1.0, sure * none)] if none >= DOUBTFUL else []
     for name, p in best.items():
         more = problem.design((*others, problem.term(p.effect, p.deviation)), state.noise)
         b = _Side(p.effect, more.x[-len(p.deviation) :], _shapes(problem, p.effect))
-        share = finding.confidence / max(finding.confidence + rivals[name], 1e-9)
-        out.append(_Pair(a, b, others, float(np.clip(share, 0.05, 0.95))))
+        share = float(np.clip(sure / max(sure + rivals[name], 1e-9), 0.05, 0.95))
+        out.append(_Pair(a, b, others, share, sure * rivals[name]))
     return out
 
 
@@ -237,6 +287,7 @@ def _shapes(problem: Problem, effect: AbstractEffect) -> tuple[_Shapes, ...]:
 class _Sums:
     """Sums over samples, which add up over recordings: of y, of the columns A, and of each shape's columns."""
 
+    n: int
     H: np.ndarray
     g: np.ndarray
     s: float
@@ -249,11 +300,11 @@ def _added(x: _Sums, y: _Sums) -> _Sums:
     def both(a, b):
         return tuple(p + q for p, q in zip(a, b, strict=True))
 
-    return _Sums(x.H + y.H, x.g + y.g, x.s + y.s, both(x.C, y.C), both(x.u, y.u), both(x.G, y.G))
+    return _Sums(x.n + y.n, x.H + y.H, x.g + y.g, x.s + y.s, both(x.C, y.C), both(x.u, y.u), both(x.G, y.G))
 
 
-def _pair_sums(problem: Problem, noise: Noise, pair: _Pair) -> tuple[_Sums, _Sums]:
-    """What a leaves for b to imitate, and the other way round."""
+def _pair_sums(problem: Problem, noise: Noise, pair: _Pair) -> tuple[_Sums, ...]:
+    """What a leaves for b to imitate, and the other way round where there is a b."""
     base = []
     for r, of_one in enumerate(problem.nuisance):
         columns = np.delete(of_one, problem.known_off, axis=2)
@@ -261,15 +312,18 @@ def _pair_sums(problem: Problem, noise: Noise, pair: _Pair) -> tuple[_Sums, _Sum
         base.append(np.concatenate([columns, *held], 2))
     A = [problem.whitened([c[:, j] for c in base], noise, j) for j in range(problem.dof)]
     H = sum(a.T @ a for a in A)
-    return _sums(problem, noise, A, H, pair.a, pair.b), _sums(problem, noise, A, H, pair.b, pair.a)
+    one = _sums(problem, noise, A, H, pair.a, () if pair.b is None else pair.b.shapes)
+    return (one,) if pair.b is None else (one, _sums(problem, noise, A, H, pair.b, pair.a.shapes))
 
 
-def _sums(problem: Problem, noise: Noise, A: list[np.ndarray], H: Any, true: _Side, rival: _Side) -> _Sums:
+def _sums(
+    problem: Problem, noise: Noise, A: list[np.ndarray], H: Any, true: _Side, rivals: Sequence[_Shapes]
+) -> _Sums:
     y = [_wide(problem, true.shapes[0], r)[:, :, 0] @ true.c for r in range(len(problem.traces))]
     y = [problem.whitened([x[:, j] for x in y], noise, j) for j in range(problem.dof)]
     g = sum(a.T @ x for a, x in zip(A, y, strict=True))
     C, u, G = [], [], []
-    for shapes in rival.shapes:
+    for shapes in rivals:
         wide = [_wide(problem, shapes, r) for r in range(len(problem.traces))]
         m, k = wide[0].shape[2:]
         parts = np.zeros((H.shape[0], m * k)), np.zeros(m * k), np.zeros((m, k, k))
@@ -285,7 +339,8 @@ def _sums(problem: Problem, noise: Noise, A: list[np.ndarray], H: Any, true: _Si
         C.append(parts[0])
         u.append(parts[1])
         G.append(parts[2])
-    return _Sums(H, np.asarray(g), float(sum(x @ x for x in y)), tuple(C), tuple(u), tuple(G))
+    n = sum(t.motion.samples for t in problem.traces)
+    return _Sums(n, H, np.asarray(g), float(sum(x @ x for x in y)), tuple(C), tuple(u), tuple(G))
 
 
 def _wide(problem: Problem, shapes: _Shapes, r: int) -> Float[np.ndarray, "_time dof m n"]:
@@ -302,8 +357,11 @@ def _wide(problem: Problem, shapes: _Shapes, r: int) -> Float[np.ndarray, "_time
     return columns
 
 
-def _discrimination(pair: _Pair, sums: Sequence[_Sums]) -> float:
+def _discrimination(pair: _Pair, sums: Sequence[_Sums], error: _Error) -> float:
     """Expected evidence for whichever of a pair is true [nats]."""
+    if pair.b is None:
+        (one,) = sums
+        return 0.5 * error.independent * one.n * float(np.log1p(_left(one, pair) / one.n))
     a, b = (_left(one, pair) for one in sums)
     return 0.5 * (pair.share * a + (1 - pair.share) * b)
 
@@ -369,149 +427,3 @@ def _placed(
         ).showing(trace.friction_shown)
         out.append(posed((new,), (True,), nuisance([new], spread, knowledge, exact)[0], background))
     return out
-
-
-def motions(
-    problem: Problem, trace: Trace, joints: Sequence[int]
-) -> list[tuple[str, Float[np.ndarray, "time dof"]]]:
-    """Candidate motions as long as a recording, on its fine grid, from rest to rest; first the recorded one.
-
-    They stay within nine tenths of the joints' limits and near the box that was recorded, and are little faster.
-    `joints` are those that the pairs are about.
-    """
-    box = _Box.around(problem)
-    n, dt = len(trace.channels.t), trace.dt
-    out = [("the recorded motion again", np.asarray(trace.channels.q))]
-    for seed in range(2):
-        out.append(("a sum of harmonics", box.fourier(n, dt, seed, 1.0)))
-    out.append(("a slow sum of harmonics", box.fourier(n, dt, 2, 0.35)))
-    for seed in range(2):
-        out.append(("moves from pose to pose with rests between", box.points(n, dt, 10 + seed, 1.0)))
-    out.append(("slow moves from pose to pose with rests between", box.points(n, dt, 12, 0.3)))
-    for j in joints[:2]:
-        name = f"joint {j + 1}"
-        out.append((f"{name} back and forth over its range at several speeds", box.sweeps(n, dt, [j], 20)))
-        out.append((f"small reversals of {name} in several poses", box.reversals(n, dt, [j], 21)))
-    out.append(("all joints back and forth at several speeds", box.sweeps(n, dt, range(problem.dof), 22)))
-    return [(kind, box.held(q)) for kind, q in out]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Box:
-    """Where, how fast and with what acceleration motions may go."""
-
-    lower: np.ndarray
-    upper: np.ndarray
-    speed: np.ndarray
-    acceleration: np.ndarray
-
-    @classmethod
-    def around(cls, problem: Problem) -> "_Box":
-        arm = problem.arm
-        every = [t.motion for t in problem.traces]
-        q = np.concatenate([m.q for m in every])
-        least, most = q.min(0), q.max(0)
-        more = 0.25 * np.maximum(most - least, 0.6)
-        lower, upper = np.asarray(arm.lower), np.asarray(arm.upper)
-        room = 0.05 * np.where(np.isfinite(upper - lower), upper - lower, 0.0)
-        return cls(
-            np.minimum(np.maximum(least - more, lower + room), least),
-            np.maximum(np.minimum(most + more, upper - room), most),
-            np.maximum(1.1 * np.abs(np.concatenate([m.qd for m in every])).max(0), 0.3),
-            np.maximum(1.1 * np.abs(np.concatenate([m.qdd for m in every])).max(0), 1.0),
-        )
-
-    def held(self, q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, "time dof"]:
-        return np.clip(q, self.lower, self.upper)
-
-    def pose(self, rng: np.random.Generator) -> np.ndarray:
-        return self.lower + rng.uniform(0.05, 0.95, len(self.lower)) * (self.upper - self.lower)
-
-    def fourier(self, n: int, dt: float, seed: int, share: float) -> np.ndarray:
-        """Five harmonics within the box, from rest to rest."""
-        rng, t = np.random.default_rng(seed), np.arange(n) * dt
-        ramp = np.clip(np.minimum(t, t[-1] - t) / 1.0, 0, 1)
-        clock = np.cumsum(ramp**2 * (3 - 2 * ramp)) * dt
-        w = 2 * np.pi * np.arange(1, 6) / max(0.6 * t[-1], 5.0)
-        a = rng.normal(size=(5, len(self.lower))) / np.arange(1, 6)[:, None]
-        phase = rng.uniform(0, 2 * np.pi, (5, len(self.lower)))
-        q = np.sum(a * np.sin(w[:, None] * clock[:, None, None] + phase), 1)
-        middle = 0.5 * (q.max(0) + q.min(0))
-        qd = np.gradient(q, dt, axis=0)
-        fastest, hardest = np.abs(qd).max(0), np.abs(np.gradient(qd, dt, axis=0)).max(0)
-        room = 0.5 * (self.upper - self.lower) / (0.5 * np.ptp(q, axis=0))
-        scale = np.min([room, share * self.speed / fastest, share * self.acceleration / hardest], 0)
-        free = 0.5 * (self.upper - self.lower) - 0.5 * scale * np.ptp(q, axis=0)
-        centre = 0.5 * (self.upper + self.lower) + rng.uniform(-0.5, 0.5, len(self.lower)) * free
-        return centre + scale * (q - middle)
-
-    def points(self, n: int, dt: float, seed: int, share: float) -> np.ndarray:
-        """Quintic moves between random poses, and rests."""
-        rng = np.random.default_rng(seed)
-        at = self.pose(rng)
-        parts, rows = [np.repeat(at[None], round(_DWELL / dt), 0)], 0
-        while rows < n:
-            to = self.pose(rng)
-            parts += [self._move(at, to, dt, share), np.repeat(to[None], round(_DWELL / dt), 0)]
-            at, rows = to, sum(map(len, parts))
-        return _cut(np.concatenate(parts), n, dt)
-
-    def sweeps(self, n: int, dt: float, joints: Sequence[int], seed: int) -> np.ndarray:
-        """Some joints to and fro at constant speeds, the others in one pose after another."""
-        rng = np.random.default_rng(seed)
-        at, parts, rows, turn = self.pose(rng), [], 0, 0
-        while rows < n:
-            to = self.pose(rng) if turn % 4 == 0 else at.copy()
-            parts.append(self._move(at, to, dt, 0.8))
-            at, share = to, (1.0, 0.15, 0.5, 0.05)[turn % 4]
-            for goal in (self.lower, self.upper):
-                to = at.copy()
-                to[list(joints)] = (0.9 * goal + 0.1 * at)[list(joints)]
-                parts.append(self._steady(at, to, dt, share, longest=4.0))
-                parts.append(np.repeat(parts[-1][-1:], round(0.3 / dt), 0))
-                at = parts[-1][-1]
-            turn, rows = turn + 1, sum(map(len, parts))
-        return _cut(np.concatenate(parts), n, dt)
-
-    def reversals(self, n: int, dt: float, joints: Sequence[int], seed: int) -> np.ndarray:
-        """In several poses, swings of decreasing size."""
-        rng = np.random.default_rng(seed)
-        at, parts, rows = self.pose(rng), [], 0
-        chosen = np.zeros(len(self.lower))
-        chosen[list(joints)] = 1.0
-        while rows < n:
-            to = self.pose(rng)
-            parts.append(self._move(at, to, dt, 0.8))
-            for size in (0.15, 0.04, 0.012):
-                period = float(np.clip(2 * np.pi * size / (0.15 * self.speed[list(joints)].min()), 0.6, 1.6))
-                t = np.arange(round(2 * period / dt)) * dt
-                swing = size * np.sin(2 * np.pi * t / period) * np.sin(np.pi * t / t[-1])
-                parts.append(to + chosen * swing[:, None])
-            at, rows = to, sum(map(len, parts))
-        return _cut(np.concatenate(parts), n, dt)
-
-    def _move(self, at: np.ndarray, to: np.ndarray, dt: float, share: float) -> np.ndarray:
-        """Quintic, as fast as allowed."""
-        way = np.abs(to - at)
-        slow = 15 / 8 * way / (share * self.speed)
-        hard = np.sqrt(5.7735 * way / (share * self.acceleration))
-        s = np.linspace(0, 1, max(round(max(slow.max(), hard.max(), 0.2) / dt), 2))[:, None]
-        return at + (to - at) * s**3 * (10 - 15 * s + 6 * s**2)
-
-    def _steady(self, at: np.ndarray, to: np.ndarray, dt: float, share: float, longest: float) -> np.ndarray:
-        """At constant speed, cut short where it would take too long."""
-        way = np.abs(to - at)
-        needed = float((way / (share * self.speed)).max())
-        reach = min(1.0, longest / max(needed, 1e-9))
-        rows = max(round(reach * needed / dt), 4)
-        return at + (to - at) * reach * np.linspace(0, 1, rows)[:, None]
-
-
-def _cut(q: Float[np.ndarray, "_rows dof"], n: int, dt: float) -> Float[np.ndarray, "_n dof"]:
-    """The first n rows, corners rounded, coming to rest at the end."""
-    smooth: Callable = scipy.ndimage.gaussian_filter1d
-    q = smooth(q[:n], 0.04 / dt, axis=0, mode="nearest")
-    tail = min(round(0.6 / dt), n // 4)
-    s = np.linspace(0, 1, tail)
-    clock = np.concatenate([np.arange(n - tail), n - tail + tail * (s - 0.5 * s**2)])
-    return scipy.interpolate.CubicSpline(np.arange(n), q)(np.minimum(clock, n - 1))

@@ -17,6 +17,7 @@ from ..versions import version
 from .diagnosis import NEXT_MOTION, Diagnosis
 from .finding import Finding
 from .localise import REGIMES, Localisation, lag_profile, order_spectrum, since_reversal
+from .next_motion import NOTHING, Told
 from .state import coefficients
 from .two_sided import TwoSided
 from .unnamed import sines
@@ -91,10 +92,7 @@ def _verdict(found: Diagnosis, document: Mapping[str, Any], names: Sequence[str]
         )
     if found.next_motion is not None:
         told = found.next_motion.pairs[0]
-        sentences.append(
-            f"To decide between {_plain(told.finding)} and {_plain(told.rival)}, record {NEXT_MOTION}:"
-            f" {found.next_motion.kind}."
-        )
+        sentences.append(f"To learn {_question(told)}, record {NEXT_MOTION}: {found.next_motion.kind}.")
     columns = summaries.fit_columns(document["fit"])
     table = summaries.by_joint(
         f"Torque error in the band of the diagnosis, rms [{found.problem.arm.unit('N·m')}]", names, columns
@@ -458,12 +456,19 @@ def _replays(found: Diagnosis, names: Sequence[str]) -> Section:
     )
 
 
+def _question(told: Told) -> str:
+    """What a pair leaves open, in words."""
+    if told.rival == NOTHING:
+        return f"whether {_plain(told.finding)} is there at all"
+    return f"whether it is {_plain(told.finding)} or {_plain(told.rival)}"
+
+
 def _next(found: Diagnosis, names: Sequence[str]) -> Section:
     motion = found.next_motion
     assert motion is not None
     rows = [
         [
-            f"{_plain(p.finding)} or {_plain(p.rival)}",
+            _question(p),
             number(None if p.joint is None else p.joint + 1),
             f"{p.nats:.1f}",
             f"{p.nats_repeated:.1f}",
@@ -484,14 +489,14 @@ def _next(found: Diagnosis, names: Sequence[str]) -> Section:
     return Section(
         "The experiment that would decide",
         [
-            f"These recordings leave more than one explanation. Most would be learned from {motion.kind}"
+            f"These recordings leave open what is in the table. Most would be learned from {motion.kind}"
             f"{' (nothing tried does better)' if again else ''}: {motion.time[-1]:.0f} s, in {NEXT_MOTION}.",
-            "It stays within the joints' limits and near the box that was recorded, but knows nothing of what"
-            " stands around the arm: look at it before it is run.",
+            "It stays within the joints' limits and near the box that was recorded, and is little faster."
+            f" {motion.said} Look at it before it is run.",
         ],
         [
             Table(
-                ["to decide between", "joint", "expected of this motion", "of the recorded one again"],
+                ["open", "joint", "expected of this motion", "of the recorded one again"],
                 rows,
                 "Expected log odds of whichever is true; 5 is 150 to 1",
             ),

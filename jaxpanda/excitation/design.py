@@ -34,8 +34,8 @@ from ..arms.arm import Arm
 from ..friction import LINEAR, columns
 from ..parameters import Base
 from ..simulation import FourierTrajectory
-from .limits import Limits
-from .scene import Probes
+from ..workspace.limits import Limits
+from ..workspace.scene import Probes
 
 Criterion = Literal["logdet", "condition"]
 FRICTION = "coulomb_viscous_offset"

@@ -21,10 +21,10 @@ from ..friction import LINEAR
 from ..identification import Identification
 from ..parameters import Base, arm_base_parameters
 from ..simulation import FourierTrajectory
+from ..workspace.limits import Limits, limits_of
+from ..workspace.scene import CLEARANCE, Closest, Scene, probes_of, reach_of, scene_of
 from .design import FRICTION, Criterion, Fourier, Task, friction_columns, gram, rows, solve, starts
-from .limits import Limits, limits_of
 from .result import Check, Excitation, Precision
-from .scene import Closest, Scene, probes_of, scene_of
 
 CUTOFF = 5.0
 """Of the low-pass in `identify` [Hz]: two independent samples a period of it."""
@@ -57,7 +57,7 @@ def excite(
     torque_noise: Sequence[float] = (),
     share: float = 0.9,
     margin: float = 0.05,
-    clearance: float = 0.05,
+    clearance: float = CLEARANCE,
     floor: float | None = 0.0,
     collisions: bool = True,
     count: int = 8,
@@ -278,8 +278,7 @@ def verify(scene: Scene, arm: Arm, limits: Limits, trajectory: FourierTrajectory
     if not scene.pairs:
         return check
     time, q, qd, _, _ = _states(trajectory)
-    reach = float(np.linalg.norm(np.asarray(arm.chain.p), axis=1).sum()) + 0.3
-    speed = 2 * float(np.abs(qd).sum(1).max()) * reach
+    speed = 2 * float(np.abs(qd).sum(1).max()) * reach_of(arm)
     closest = scene.closest(time, q, speed)
     failed = check.failed
     if closest.distance < scene.clearance:

@@ -12,9 +12,9 @@ from ..arms.arm import Arm
 from ..files import Kind, finite, output_folder, write_json, write_text
 from ..parameters import Base
 from ..simulation import FourierTrajectory
+from ..workspace.limits import Limits
+from ..workspace.scene import Closest
 from .design import Found
-from .limits import Limits
-from .scene import Closest
 
 SCHEMA = "jaxpanda.excitation/1"
 FILE, CSV, ROS, UR = "excitation.json", "excitation.csv", "joint_trajectory.yaml", "excitation.script"

@@ -27,6 +27,10 @@ from ..arms.mjcf import MjcfSource, with_shapes
 from ..errors import InputError, reason
 from .limits import is_franka_panda, published
 
+CLEARANCE = 0.05
+"""That a motion keeps from what it could run into, where nobody says another [m]."""
+_STEP = 0.005
+"""What may happen between two looks at a pair [m]."""
 _POSES = 300
 """Random poses that show which pairs could touch."""
 _ALWAYS = 0.95
@@ -151,6 +155,36 @@ class Scene:
                 )
             due[at] = k + 1 + np.floor(np.maximum(d - best.distance, 0) / (speed * dt + 1e-12)).astype(int)
         return best
+
+    def distance_kept(self, arm: Arm, q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " pair"]:
+        """How near each pair comes along a motion, at most the clearance [m]."""
+        kept = np.full(len(self.pairs), self.clearance)
+        for at, d in self._looks(arm, q, kept):
+            kept[at] = np.minimum(kept[at], d)
+        return kept
+
+    def is_clear(self, arm: Arm, q: Float[np.ndarray, "time dof"], kept: Float[np.ndarray, " pair"]) -> bool:
+        """Whether no pair comes nearer along a motion than `kept` [m], but for what one step may change."""
+        return all(np.all(d >= kept[at] - _STEP) for at, d in self._looks(arm, q, kept))
+
+    def _looks(
+        self, arm: Arm, q: Float[np.ndarray, "time dof"], kept: Float[np.ndarray, " pair"]
+    ) -> Iterator[tuple[Int[np.ndarray, " some"], Float[np.ndarray, " some"]]]:
+        """Pairs that could have come as near as `kept`, and their distances [m], from pose to pose."""
+        data, due = mujoco.MjData(self.model), np.zeros(len(self.pairs))
+        each = np.where(np.asarray(arm.chain.prismatic), 1.0, reach_of(arm))
+        gone = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(q, axis=0)) @ each)])
+        for pose, so_far in zip(q, gone, strict=True):
+            at = np.flatnonzero(due <= so_far)
+            if len(at):
+                d = self.distances(data, pose, [self.pairs[i] for i in at], 10.0)
+                due[at] = so_far + np.maximum(d - kept[at], _STEP)
+                yield at, d
+
+
+def reach_of(arm: Arm) -> float:
+    """How far a point of an arm, or of what it holds, may be from an axis of its own [m]."""
+    return float(np.linalg.norm(np.asarray(arm.chain.p), axis=1).sum()) + 0.3
 
 
 def scene_of(
