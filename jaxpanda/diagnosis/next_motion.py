@@ -11,7 +11,8 @@ and Hill 1967); of several rivals the one that is told least decides.
 
 A finding that is in doubt although no rival is likely may be none: what no law of the catalogue describes has
 passed for it. Then δ² is what the nuisance cannot imitate, and its evidence is $\tfrac12 n \log(1 + \delta^2/n)$
-with n independent samples, as in `state.foretelling`. W is that of the error where the model was not fitted.
+with n independent samples, as in `state.foretelling`. W is that of the error where the model was not fitted; the
+same motion makes the same errors again, so that repeating it tells nothing of that.
 """
 
 import dataclasses
@@ -224,7 +225,8 @@ class _Error:
 def _told(
     problem: Problem, new: Sequence[Problem], error: _Error, pairs: Sequence[_Pair]
 ) -> list[list[float]]:
-    """For each motion and pair, the evidence that the motion is expected to bring [nats]."""
+    """For each motion, the first of which is the recorded one, and pair the evidence that it is expected to bring
+    [nats]."""
     noise = error.noise
     old = [_pair_sums(problem, noise, pair) for pair in pairs]
     known = [_discrimination(pair, sums, error) for pair, sums in zip(pairs, old, strict=True)]
@@ -237,7 +239,9 @@ def _told(
             row.append(_discrimination(pair, together, error) - already)
         return row
 
-    return parallel(told, new)
+    rows = parallel(told, new)
+    rows[0] = [0.0 if pair.b is None else nats for pair, nats in zip(pairs, rows[0], strict=True)]
+    return rows
 
 
 def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
