@@ -162,6 +162,15 @@ def test_motions_keep_clear_of_what_the_file_holds(known):
         assert np.ptp(q, axis=0).max() > 0.1, kind
 
 
+def test_where_meshes_are_missing_it_is_said_that_nobody_looked(known, tmp_path):
+    text = panda_mjcf().replace(
+        "<worldbody>", '<asset><mesh name="shell" file="none.stl"/></asset><worldbody>', 1
+    )
+    text = text.replace('<body name="link0">', '<body name="link0"><geom type="mesh" mesh="shell"/>', 1)
+    source = from_document(parse(text, "mujoco", tmp_path / "panda.xml"))[1]
+    assert Surroundings.around(known[0], source).said.startswith("Collisions were not checked: ")
+
+
 def test_what_is_in_doubt_without_a_rival_is_looked_for_again(known):
     problem, spread, state, finding = known
     doubted = dataclasses.replace(finding, confidence=0.4, alternatives=())
