@@ -171,6 +171,19 @@ def test_where_meshes_are_missing_it_is_said_that_nobody_looked(known, tmp_path)
     assert Surroundings.around(known[0], source).said.startswith("Collisions were not checked: ")
 
 
+def test_bodies_without_names_and_beside_the_arm_have_their_places(known):
+    """Whatever stands before or beside the arm in the file, geoms belong to the links that carry them."""
+    bodies = """<body name="post"><geom type="sphere" size="0.01"/><body/></body>"""
+    text = panda_mjcf().replace("<worldbody>", f"<worldbody>{bodies}", 1)
+    plain = scene_of(Arm.panda(), SOURCE, CLEARANCE, None)
+    source = from_document(parse(text.replace('name="link4"', ""), "mujoco", Path("panda.xml")))[1]
+    scene = scene_of(Arm.panda(), source, CLEARANCE, None)
+    recorded = np.asarray(known[0].traces[0].channels.q)[::50]
+    kept = [s.distance_kept(Arm.panda(), recorded) for s in (plain, scene)]
+    assert len(scene.pairs) == len(plain.pairs)
+    np.testing.assert_allclose(kept[1], kept[0], atol=1e-9)
+
+
 def test_what_is_in_doubt_without_a_rival_is_looked_for_again(known):
     problem, spread, state, finding = known
     doubted = dataclasses.replace(finding, confidence=0.4, alternatives=())

@@ -241,17 +241,14 @@ def scene_of(
 
 def _shapes(spec: mujoco.MjSpec, arm: Arm, source: MjcfSource, notes: list[str]) -> bool:
     """See to it that the arm has geometry; whether contype and conaffinity of geoms count."""
-    names = {link.body for link in source.links}
-    bodies = [body for body in spec.bodies if body.name in names]
+    every = list(spec.bodies)  # in the order of the compiled model; they need not have names
+    bodies = [every[link.body_id] for link in source.links]
     own = [geom for body in bodies for geom in body.find_all("geom")] if bodies else []
     if any(geom.contype or geom.conaffinity for geom in own):
         return True
     if is_franka_panda(arm):
         for k, capsule in enumerate(published()["panda"]["capsules"]):
-            if capsule["link"]:
-                body = spec.body(source.links[capsule["link"] - 1].body)
-            else:
-                body = spec.body(source.links[0].body).parent
+            body = bodies[capsule["link"] - 1] if capsule["link"] else bodies[0].parent
             body.add_geom(
                 name=f"capsule {k + 1} of link {capsule['link']}",
                 type=mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -270,17 +267,17 @@ def _shapes(spec: mujoco.MjSpec, arm: Arm, source: MjcfSource, notes: list[str])
 
 
 def _owners(model: mujoco.MjModel, source: MjcfSource) -> Int[np.ndarray, " body"]:
-    link = {one.body: k for k, one in enumerate(source.links)}
+    link = {one.body_id: k for k, one in enumerate(source.links)}
     owner = np.full(model.nbody, -1)
     for body in range(1, model.nbody):
-        owner[body] = link.get(model.body(body).name, owner[model.body_parentid[body]])
+        owner[body] = link.get(body, owner[model.body_parentid[body]])
     return owner
 
 
 def _pairs(scene: Scene, shaped: bool) -> Iterator[Pair]:
     """Geoms of different links, or of a link and what stands still, that MuJoCo would let touch."""
     model, owner = scene.model, scene.owner
-    base = int(model.body(scene.source.links[0].body).parentid[0])
+    base = int(model.body_parentid[scene.source.links[0].body_id])
     apart = {tuple(sorted(divmod(int(s), 1 << 16))) for s in model.exclude_signature}
     for a, b in itertools.combinations(range(model.ngeom), 2):
         if _HFIELD in (model.geom_type[a], model.geom_type[b]):
@@ -373,7 +370,7 @@ def _boxes(scene: Scene) -> Mapping[int, _Box]:
     mujoco.mj_kinematics(model, data)
     frames = {-1: (np.eye(3), np.zeros(3))}
     for k, link in enumerate(scene.source.links):
-        body = model.body(link.body).id
+        body = link.body_id
         R = data.xmat[body].reshape(3, 3)
         frames[k] = (R @ link.R, data.xpos[body] + R @ link.p)
     out = {}
