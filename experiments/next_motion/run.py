@@ -9,7 +9,6 @@ left open; its probability is what a diagnosis says of it, its truth stands in t
 """
 
 import argparse
-import contextlib
 import json
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -188,6 +187,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     folder, answers = options.out / "cases", options.answers or options.out / "answers"
     jobs = []
     for index, (kind, turn) in enumerate(case_list(list(SHARES), options.count)):
@@ -206,10 +206,9 @@ def main() -> None:
                     results.append(done)
                     print(report([done]).split("\n\n", 1)[1], flush=True)
     (options.out / "results.json").write_text(json.dumps(results, indent=1))
-    with contextlib.suppress(ValueError):
-        text = report(results)
-        (options.out / "report.txt").write_text(text + "\n")
-        print("\n" + text)
+    text = report(results)
+    (options.out / "report.txt").write_text(text + "\n")
+    print("\n" + text)
 
 
 if __name__ == "__main__":

@@ -256,6 +256,11 @@ def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
     if not (rivals or none >= DOUBTFUL) or stands_in or term.effect.bound_to_recording:
         return []
     others = (*state.terms[:i], *state.terms[i + 1 :])
+    a = _Side(term.effect, coefficients(state, i), _shapes(problem, term.effect))
+    sure = finding.confidence
+    out = [_Pair(a, None, others, 1.0, sure * none)] if none >= DOUBTFUL else []
+    if not rivals:
+        return out
     design = problem.design(others, state.noise)
     groups = [g for g in (*problem.library, *problem.catchalls) if g.name in rivals]
     proposals = [*grids(problem, design, state.noise, groups)]
@@ -266,9 +271,6 @@ def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
         name = p.effect.name
         if name in rivals and (name not in best or p.evidence > best[name].evidence):
             best[name] = p
-    a = _Side(term.effect, coefficients(state, i), _shapes(problem, term.effect))
-    sure = finding.confidence
-    out = [_Pair(a, None, others, 1.0, sure * none)] if none >= DOUBTFUL else []
     for name, p in best.items():
         more = problem.design((*others, problem.term(p.effect, p.deviation)), state.noise)
         b = _Side(p.effect, more.x[-len(p.deviation) :], _shapes(problem, p.effect))
