@@ -106,15 +106,16 @@ class Noise:
     ) -> Float[np.ndarray, "_time ..."]:
         rests = self._rests(joint, weights, rows)
         if rests is not None:
-            at, u = rests
+            at, u, back = rests
             here = y[at].reshape(len(at), -1)
-            y[at] -= (u.T @ (u @ here)).reshape(len(at), *y.shape[1:])
+            y[at] -= (back @ (u @ here)).reshape(len(at), *y.shape[1:])
         return y
 
     def _rests(
         self, joint: int, weights: Float[np.ndarray, " _time"], rows: slice
-    ) -> tuple[Int[np.ndarray, " resting"], scipy.sparse.csr_array] | None:
-        """Which rows are in rests, and u of each rest there, by the root of what it takes of its own."""
+    ) -> tuple[Int[np.ndarray, " resting"], scipy.sparse.csr_array, scipy.sparse.csr_array] | None:
+        """Which rows are in rests, and u of each rest there, by the root of what it takes of its own; and its
+        transpose."""
         key = joint, rows.start, rows.stop
         if self.stays is None or key in self._held:
             return self._held.get(key)
@@ -127,11 +128,11 @@ class Noise:
         share = np.sqrt((1 - 1 / np.sqrt(1 + power)) / power)
         values = u[at] * np.repeat(share, np.diff(ends))
         each_row = scipy.sparse.csr_array((values, np.arange(len(at)), ends), shape=(len(each), len(at)))
-        self._held[key] = (at, each_row) if each else None
+        self._held[key] = (at, each_row, each_row.T.tocsr()) if each else None
         return self._held[key]
 
     @functools.cached_property
-    def _held(self) -> dict[tuple[int, int, int], tuple[np.ndarray, scipy.sparse.csr_array] | None]:
+    def _held(self) -> dict[tuple[int, int, int], tuple[np.ndarray, Any, Any] | None]:
         return {}
 
     def level(
