@@ -10,6 +10,7 @@ import scipy.linalg
 from jaxpanda import Arm, Recording, validation
 from jaxpanda import signals as signals_
 from jaxpanda.diagnosis import search
+from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.shapes import _score
@@ -138,6 +139,26 @@ def test_a_term_defends_its_place_with_its_own_shape(problem: Problem):
     found, _ = search.instead(problem, state, 0)
     (gained,) = [gained for gained, terms in found if terms == state.terms]
     assert gained == pytest.approx(search.gains(problem, state)[0])
+
+
+def test_laws_that_oppose_each_other_are_refused(problem: Problem, monkeypatch):
+    """What two laws nearly alike leave of each other is a small torque, and both may be as large as one likes."""
+    laws = [TorqueRipple(3, order, "one") for order in (33.7, 33.75)]
+    rng, traces = np.random.default_rng(0), []
+    for trace, *columns in zip(problem.traces, *map(problem.full_columns, laws), strict=True):
+        torque = 100.0 * (columns[0] - columns[1])[:, :, 0] + rng.normal(0, 1e-3, trace.residual.shape)
+        traces.append(dataclasses.replace(trace, tau=trace.motion.torque + torque))
+    posed = pose(tuple(traces), (True, True), "identified").problem
+    large = np.array([100.0, 100.0])
+    terms, noise = (posed.term(laws[0], large),), posed.noise(())
+    added = Proposal(laws[1], 0.0, 0.0, large, ())
+    left = np.concatenate(posed.residual)[:, 3]
+    assert np.sqrt(np.mean(left**2)) < 10.0
+    chosen = lambda: search.choices(posed, terms, posed.design(terms, noise), noise, [added])
+    assert not chosen()
+    monkeypatch.setattr(search, "LARGEST", np.inf)
+    ((gained, _),) = chosen()
+    assert gained > 100.0
 
 
 def test_what_a_model_explains_of_a_joints_candidates_takes_its_coefficients_there_alone(problem: Problem):

@@ -142,6 +142,16 @@ class Problem:
         return [trace.residual for trace in self.traces]
 
     @functools.cached_property
+    def left_by_user(self) -> Float[np.ndarray, " dof"]:
+        """What the user's model leaves of each joint's torque, `weighed`; at least the steps it has [N m]."""
+        return np.maximum(self.weighed(self.residual), np.max([t.torque_step for t in self.traces], 0))
+
+    def weighed(self, torque: Sequence[Float[np.ndarray, "_time dof"]]) -> Float[np.ndarray, " dof"]:
+        """Root mean square of each joint's torque in all recordings, by what samples weigh [N m]."""
+        parts = [x * t.weights for x, t in zip(torque, self.traces, strict=True)]
+        return np.sqrt(np.mean(np.concatenate(parts) ** 2, 0))
+
+    @functools.cached_property
     def grid(self) -> Grid:
         """Shapes of effects on these recordings, and their columns."""
         return self.shapes or Grid(self.traces, self.active, self.catalogue)
