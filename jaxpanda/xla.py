@@ -10,6 +10,7 @@ import numpy as np
 _CHUNK = 1024
 """Samples that one compiled call takes."""
 _ON_CPU = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+_ON_GPU = {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False}
 
 
 @functools.cache
@@ -25,14 +26,25 @@ def options(platform: str | None = None) -> dict[str, Any] | None:
     Args:
         platform: "cpu", "gpu", …; that of JAX's default device when None.
     """
-    if (platform or jax.default_backend()) != "cpu":
-        return None
+    return _if_known("cpu", _ON_CPU) if (platform or jax.default_backend()) == "cpu" else None
+
+
+@functools.cache
+def options_of_solver(platform: str) -> dict[str, Any] | None:
+    """The same for the solver of the retrieval, and on a GPU too: there XLA tries which of its kernels suits each
+    product best, which takes three to four times as long as a million starts do, and makes them a fiftieth faster
+    (`experiments/speed/run.py --gpu`)."""
+    return _if_known("gpu", _ON_GPU) if platform == "gpu" else options(platform)
+
+
+def _if_known(platform: str, some: dict[str, Any]) -> dict[str, Any] | None:
+    """These options where XLA of this version knows them."""
     try:
-        with jax.default_device(jax.devices("cpu")[0]):
-            jax.jit(lambda x: x, compiler_options=_ON_CPU).lower(0.0).compile()
-    except jax.errors.JaxRuntimeError:  # of another version
+        with jax.default_device(jax.devices(platform)[0]):
+            jax.jit(lambda x: x, compiler_options=some).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:
         return None
-    return _ON_CPU
+    return some
 
 
 def chunked(function: Callable, arm: Any, *arrays: np.ndarray) -> np.ndarray:

@@ -25,8 +25,10 @@ def test_sources_that_were_never_installed_have_a_version(monkeypatch):
 def test_compiler_options_are_those_that_xla_knows(known, monkeypatch):
     if not known:
         monkeypatch.setattr(xla, "_ON_CPU", {"xla_option_of_another_version": True})
-    xla.options.cache_clear()
+    clear = lambda: [f.cache_clear() for f in (xla.options, xla.options_of_solver)]
+    clear()
     assert (xla.options() is not None) == known
     assert xla.options("gpu") is None
+    assert xla.options_of_solver("cpu") == xla.options("cpu")
     assert jit_mjx(lambda x: 2 * x)(0.5) == 1.0
-    xla.options.cache_clear()
+    clear()

@@ -21,7 +21,7 @@ from jax.sharding import SingleDeviceSharding
 from jaxtyping import Array, Int, PyTree
 
 from ..ranks import ALONE, Ranks
-from ..xla import options as compiler_options
+from ..xla import options_of_solver
 from .checkpoint import Checkpoint
 
 Chunk = Callable[..., PyTree[Array]]
@@ -172,7 +172,7 @@ def _program(
     shaped = lambda shape, dtype: jax.ShapeDtypeStruct(shape, dtype, sharding=where)
     leaves = [shaped(shape, dtype) for shape, dtype in shapes]
     lowered = jitted.lower(leaves, shaped((chunk,), jnp.asarray(0).dtype))
-    return lowered.compile(compiler_options=compiler_options(device.platform)), lowered.out_info[0]
+    return lowered.compile(compiler_options=options_of_solver(device.platform)), lowered.out_info[0]
 
 
 def _taken_up(checkpoint: Checkpoint | None, outcome: tuple[np.ndarray, ...], ranks: Ranks) -> int:
