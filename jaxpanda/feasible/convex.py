@@ -48,7 +48,7 @@ class Sizes(NamedTuple):
     """How many of them take their steps together, and how many when no more than these are left (`turns`)."""
 
 
-CPU, GPU, GPU_MANY = Sizes(256, (16,)), Sizes(262144, (8192,)), Sizes(524288, (65536, 2048))
+CPU, GPU, GPU_MANY = Sizes(256, (16,)), Sizes(262144, (8192,)), Sizes(524288, (65536, 8192, 1024))
 """A processor's cache holds 16 of the steps' matrices, not 128; and few lanes for many starts wait little for the
 slowest. On a GPU 65536 take half the time for each that 8192 do, and twice as long to compile."""
 _MANY = 2**20  # starts that are worth that
