@@ -322,7 +322,7 @@ def test_what_known_friction_holds_through_a_long_rest_is_no_law_of_its_own():
     assert not [step for step in steps if step.startswith("add")]
 
 
-@pytest.mark.parametrize("held", [0.5, 0.2, -0.3])
+@pytest.mark.parametrize("held", [0.5, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.2, -0.3))])
 def test_friction_that_holds_a_load_through_a_long_rest_is_friction_alone(held):
     """What it holds is no offset beside it."""
     problem = pose((prepare(resting(0.5, held), Arm.panda()),), (True,), "exact").problem

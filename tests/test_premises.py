@@ -33,7 +33,7 @@ def test_what_healthy_recordings_show_may_be_refitted_in_all_recordings():
     assert not np.any(news[1])  # an effect that is searched for acts in the suspect recording alone
 
 
-@pytest.mark.parametrize("comes_again", [True, False])
+@pytest.mark.parametrize("comes_again", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_what_healthy_recordings_show_is_predicted_where_it_comes_again(monkeypatch, comes_again):
     """Two seconds of an arm had a crosstalk of 1.05, with which another motion was predicted 20 N·m off."""
     motion, made = random_trajectory(panda_mjcf(), 1, period=3.0), []
