@@ -33,6 +33,10 @@ PHYSICAL_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Sizes over the physically plausible one, where a coefficient has such."""
 
 
+Rests = tuple[Int[np.ndarray, " resting"], scipy.sparse.csr_array, scipy.sparse.csr_array]
+"""Which rows are in rests, u of each rest there, by the root of what it takes of its own, and its transpose."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Noise:
     """Autoregressive noise of each joint: $e_t = r_t - \\sum_k a_k r_{t-k}$, with deviation `sigma` [N m]."""
@@ -111,11 +115,8 @@ class Noise:
             y[at] -= (back @ (u @ here)).reshape(len(at), *y.shape[1:])
         return y
 
-    def _rests(
-        self, joint: int, weights: Float[np.ndarray, " _time"], rows: slice
-    ) -> tuple[Int[np.ndarray, " resting"], scipy.sparse.csr_array, scipy.sparse.csr_array] | None:
-        """Which rows are in rests, and u of each rest there, by the root of what it takes of its own; and its
-        transpose."""
+    def _rests(self, joint: int, weights: Float[np.ndarray, " _time"], rows: slice) -> Rests | None:
+        """Where a joint rests among some rows."""
         key = joint, rows.start, rows.stop
         if self.stays is None or key in self._held:
             return self._held.get(key)
@@ -132,7 +133,7 @@ class Noise:
         return self._held[key]
 
     @functools.cached_property
-    def _held(self) -> dict[tuple[int, int, int], tuple[np.ndarray, Any, Any] | None]:
+    def _held(self) -> dict[tuple[int, int, int], Rests | None]:
         return {}
 
     def level(
