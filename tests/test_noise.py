@@ -37,6 +37,16 @@ def noise_of(seconds: float, seed: int):
     return pose((prepare(still_right(seconds, seed), ARM),), (True,), "exact").problem.noise(())
 
 
+def test_a_simulation_without_noise_is_consistent():
+    """Over so little noise a prior was less than what rounding takes off a product: nothing could be solved."""
+    t = np.arange(0, 8, 1 / 200)
+    for seed, noise in ((0, 1e-6), (1, 0.0)):
+        q, *rates = excitation(ARM, t, seed)
+        tau = np.asarray(LOAD(q, *rates)) + noise * np.random.default_rng(0).normal(size=q.shape)
+        found = diagnose(None, [Recording("simulated.csv", t, q, tau=tau)])
+        assert found.verdict == "consistent"
+
+
 def test_noise_of_a_short_recording_is_that_of_a_long_one():
     long = noise_of(12.0, 0)
     short = [noise_of(2.4, seed) for seed in range(4)]

@@ -27,6 +27,9 @@ DETAILS = (1.0, 0.6, 0.35, 0.2)
 """Shares of the knots that its smooth functions have; the first that leaves so much free is taken."""
 QUIETEST = 1e-9
 """Noise is taken for at least this [N m]."""
+_RESOLVED = 1e-6
+"""Share of a joint's torque for which its noise is taken at least: of squares 1e-16 is lost by rounding, so that
+beside less, as of a simulation without noise, a prior could not be told."""
 _RANK = 1e-6  # least singular value that counts, as a share of the largest
 _SHARES = (0.0, 0.001, 0.01, 0.1, 1.0)
 """Of the variance of what laws may be off from sample to sample, those that are told apart."""
@@ -170,7 +173,9 @@ class Saturation:
         taken = sum((self.moments(V) for V in bases[1:]), basis.taken)
         count, used = basis.count, sum(U.shape[1] for U in bases)
         variance = float(r @ r) / max(count - used, LEAST_FREE * count)
-        a, sigma, std = autoregression(self.moments(r[:, None]) + variance * taken, count)
+        a, *noise = autoregression(self.moments(r[:, None]) + variance * taken, count)
+        torque = np.concatenate([t.motion.torque[:, joint] for t in self.traces])
+        sigma, std = np.maximum(noise, _RESOLVED * np.sqrt(np.mean(torque**2))).tolist()
         b = np.concatenate([[1.0], -a])
         left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)]) / sigma
         counts = self._weight(joint) ** 2 * (left != 0) * (holds == 0)
