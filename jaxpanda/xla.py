@@ -32,7 +32,7 @@ def options(platform: str | None = None) -> dict[str, Any] | None:
 @functools.cache
 def options_of_solver(platform: str) -> dict[str, Any] | None:
     """The same for the solver of the retrieval, and on a GPU too: there XLA tries which of its kernels suits each
-    product best, which takes three to four times as long as a million starts do, and makes them a fiftieth faster
+    product best, which takes longer than a million starts do and hardly makes them faster
     (`experiments/speed/run.py --gpu`)."""
     return _if_known("gpu", _ON_GPU) if platform == "gpu" else options(platform)
 

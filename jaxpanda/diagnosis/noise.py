@@ -174,8 +174,7 @@ class Saturation:
         count, used = basis.count, sum(U.shape[1] for U in bases)
         variance = float(r @ r) / max(count - used, LEAST_FREE * count)
         a, *noise = autoregression(self.moments(r[:, None]) + variance * taken, count)
-        torque = np.concatenate([t.motion.torque[:, joint] for t in self.traces])
-        sigma, std = np.maximum(noise, _RESOLVED * np.sqrt(np.mean(torque**2))).tolist()
+        sigma, std = np.maximum(noise, self._resolved[joint]).tolist()
         b = np.concatenate([[1.0], -a])
         left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)]) / sigma
         counts = self._weight(joint) ** 2 * (left != 0) * (holds == 0)
@@ -184,6 +183,12 @@ class Saturation:
         free = rests * (1 - sum(np.sum(U**2, 1) for U in bases))
         quiet = (rests @ left**2 + FEWEST_FREE) / (np.sum(free) + FEWEST_FREE)
         return JointNoise(a, sigma * scale, std, float(quiet), share * scale**2, std * scale)
+
+    @functools.cached_property
+    def _resolved(self) -> Float[np.ndarray, " dof"]:
+        """The least noise that each joint's torque is told from [N m]."""
+        torque = np.concatenate([t.motion.torque for t in self.traces])
+        return _RESOLVED * np.sqrt(np.mean(torque**2, 0))
 
     def tells(self, joint: int) -> bool:
         """Whether the recordings are long enough for the model to leave noise of a joint to be seen."""

@@ -36,8 +36,8 @@ from .state import (
 OPPOSED = 20.0
 """How many times the torque of a law its parts may be."""
 LARGEST = 5.0
-"""How many times what the user's model leaves of a joint a law may be. Causes that do not know of each other add
-up: of 500 findings in trials, right ones were at most twice that."""
+"""How many times what the user's model leaves of a joint a law may be: causes that do not know of each other add
+up."""
 WORTH = 1.03
 """By which the squared error of predicted torque must be smaller than with the user's model."""
 BETTER = 1.0

@@ -41,8 +41,7 @@ def buildable(source: MjcfSource, corrected: Corrected, problem: Problem) -> Cor
     if not np.any(np.asarray(corrected.change)) or are_buildable(standard - carried):
         return corrected
     built, off = _nearest(source, standard, problem)
-    noise, weights = problem.noise(()).std, np.concatenate([t.weights for t in problem.traces])
-    users = np.sqrt(np.mean((weights * np.concatenate(problem.residual)) ** 2, 0))
+    noise, users = problem.noise(()).std, problem.weighed(problem.residual)
     if np.any((off > UNSEEN * noise) & (np.hypot(noise, off) > users)):
         return corrected
     return eqx.tree_at(lambda c: c.change, corrected, corrected.change + (built - standard))
