@@ -35,6 +35,8 @@ Device = Any
 
 _PIECE = 16384
 """Starts fetched at once: memory for a large chunk would be new to the process every time, page after page."""
+_COPIERS = 4
+"""Threads that copy them, for each device: one finds pages more slowly than a GPU sends rows."""
 _WORTH = 4  # chunks a further CPU device must get: it shares the cores, and compiling for it costs as much
 
 
@@ -97,10 +99,15 @@ def run(
 
     def keep(first: int, pieces: list[list[Array]]) -> None:
         """Copy what is wanted of a chunk into the outcome."""
-        for at in range(first, min(first + chunk, starts), _PIECE):
-            piece = pieces.pop(0)  # an array keeps its copy on the host as long as it lives
+        wanted = list(range(first, min(first + chunk, starts), _PIECE))
+
+        def copy(k: int) -> None:
+            # an array keeps its copy on the host as long as it lives
+            at, piece, pieces[k] = wanted[k], pieces[k], []
             for whole, part in zip(outcome, piece, strict=True):
                 whole[at : at + len(part)] = np.asarray(part)[: starts - at]
+
+        list(copiers.map(copy, range(len(wanted))))
 
     def finish(first: int, chunks: list[Future[list[list[Array]]]]) -> None:
         last = min(first + wave, starts)
@@ -123,6 +130,7 @@ def run(
         # A GPU's program asks the host whether to go round its loop again, and holds the thread that called it.
         hands = [stack.enter_context(ThreadPoolExecutor(1)) for _ in mine]
         fetchers = stack.enter_context(ThreadPoolExecutor(len(mine)))
+        copiers = stack.enter_context(ThreadPoolExecutor(_COPIERS * len(mine)))
         for first in range(done, starts, wave):
             under_way.append((first, begin(first)))
             if len(under_way) > ahead:
