@@ -14,7 +14,7 @@ import pytest
 from jaxpanda import pipeline
 from jaxpanda.__main__ import main
 from jaxpanda.errors import InputError
-from jaxpanda.feasible import Bounds, Solutions, solve
+from jaxpanda.feasible import Bounds, Solutions, schedule, solve
 from jaxpanda.feasible.checkpoint import identity
 from jaxpanda.retrieval import Retrieval
 
@@ -57,6 +57,14 @@ def interrupted(path: Path, after: int = 16, **options) -> None:
 
     with pytest.raises(Stop):
         solve(*problem(), **(SMALL | options), checkpoint=path, progress=stop)
+
+
+def test_chunks_that_are_fetched_in_pieces_come_whole_and_in_order():
+    squares = lambda factor, numbers: (factor * numbers, numbers[:, None] ** 2)
+    wide, starts = 3 * 16384 + 5, 2 * (3 * 16384 + 5) + 20000  # four pieces a chunk, the last chunk in part
+    found, _, _ = schedule.run(squares, np.asarray(2), (), starts=starts, chunk=wide)
+    np.testing.assert_array_equal(found[0], 2 * np.arange(starts))
+    np.testing.assert_array_equal(found[1][:, 0], np.arange(starts) ** 2)
 
 
 def test_an_interrupted_run_goes_on_from_its_last_chunk_with_the_same_bits(whole, tmp_path):
