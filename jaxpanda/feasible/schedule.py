@@ -97,17 +97,12 @@ def run(
         first += ranks.rank * share * chunk
         return [hands[k % len(mine)].submit(solved, k % len(mine), first + k * chunk) for k in range(share)]
 
-    def keep(first: int, pieces: list[list[Array]]) -> None:
-        """Copy what is wanted of a chunk into the outcome."""
-        wanted = list(range(first, min(first + chunk, starts), _PIECE))
-
-        def copy(k: int) -> None:
-            # an array keeps its copy on the host as long as it lives
-            at, piece, pieces[k] = wanted[k], pieces[k], []
-            for whole, part in zip(outcome, piece, strict=True):
-                whole[at : at + len(part)] = np.asarray(part)[: starts - at]
-
-        list(copiers.map(copy, range(len(wanted))))
+    def copy(at: int, one: Future[list[list[Array]]], k: int) -> None:
+        """What is wanted of a chunk's piece k into the outcome, from this start on."""
+        pieces = one.result()
+        piece, pieces[k] = pieces[k], []  # an array keeps its copy on the host as long as it lives
+        for whole, part in zip(outcome, piece, strict=True):
+            whole[at : at + len(part)] = np.asarray(part)[: starts - at]
 
     def finish(first: int, chunks: list[Future[list[list[Array]]]]) -> None:
         last = min(first + wave, starts)
@@ -117,7 +112,9 @@ def run(
             for whole, *parts in zip(outcome, *everywhere, strict=True):
                 whole[first:last] = np.concatenate(parts)[: last - first]
         else:
-            list(fetchers.map(lambda k: keep(first + k * chunk, chunks[k].result()), range(share)))
+            within = enumerate(range(0, chunk, _PIECE))  # the devices by turns, all of which send at once
+            each = [(first + i * chunk + at, one, k) for k, at in within for i, one in enumerate(chunks)]
+            list(copiers.map(lambda part: copy(*part), [part for part in each if part[0] < starts]))
         if checkpoint is not None:
             checkpoint.append(first, tuple(whole[first:last] for whole in outcome))
         if progress is not None:
@@ -129,7 +126,6 @@ def run(
     with contextlib.ExitStack() as stack:
         # A GPU's program asks the host whether to go round its loop again, and holds the thread that called it.
         hands = [stack.enter_context(ThreadPoolExecutor(1)) for _ in mine]
-        fetchers = stack.enter_context(ThreadPoolExecutor(len(mine)))
         copiers = stack.enter_context(ThreadPoolExecutor(_COPIERS * len(mine)))
         for first in range(done, starts, wave):
             under_way.append((first, begin(first)))
