@@ -325,23 +325,23 @@ def kinova(data, rng):
 
 
 def doosan(data, rng):
-    """40.7 s: every other block is the model's; the links by the controller's own model torque there."""
-    log, own = real.doosan(data), real.doosan(data, "model")
+    """40.7 s: every other block is the model's; the links by the controller's own model torque there.
+
+    Measured torque is late, the controller's own is not: it is moved to where the own links fit, or left.
+    """
+    recorded, own = real.doosan(data), real.doosan(data, "model")
+    noiseless = {"rotors": False, "friction": False, "offsets": False, "spread": 1.0}
+    everywhere = identify(real.doosan_nominal(data), [own], **noiseless).chain
+    late = lag(everywhere, [recorded], np.arange(0, 0.151, 0.005), 0.05)
+    log, note = m.put_right(recorded, late), f"torque moved by {1e3 * late:.0f} ms"
     shift = rng.uniform(-1.0, 1.0)
     edges = (0.2, 10 + shift, 20 + shift, 30 + shift, 40.5)
+    parts = list(itertools.pairwise(edges))
 
     @functools.cache
     def split(train, held, tare=True):
-        parts = list(itertools.pairwise(edges))
         ident = [parts[k] for k in range(4) if k not in (train, held)]
-        links = identify(
-            real.doosan_nominal(data),
-            [own.part(*p) for p in ident],
-            rotors=False,
-            friction=False,
-            offsets=False,
-            spread=1.0,
-        )
+        links = identify(real.doosan_nominal(data), [own.part(*p) for p in ident], **noiseless)
         return m.split(
             "doosan",
             links.chain,
@@ -356,11 +356,13 @@ def doosan(data, rng):
 
     pick = lambda *joints: int(rng.choice(joints))
     order = [int(k) for k in rng.permutation(2)]
-    s, other = (((1, 3), (2, 0))[k] for k in order)
-    s, other = split(*s), split(*other)
-    yield s, m.control(s)
-    yield other, m.control(other, reference=True)
+    which = [((1, 3), (2, 0))[k] for k in order]
+    s, other = (split(*k) for k in which)
+    train, held = (recorded.part(*parts[k]) for k in which[0])
+    yield s, m.control(s, note=note)
+    yield other, m.control(other, reference=True, note=note)
     yield s, m.untared(s)
+    yield s, m.late(s, late, ([train], held))
     yield other, m.friction_lost(other)
     yield s, m.placeholders(s)
     yield other, m.nominal_links(other, real.doosan_nominal(data))
