@@ -202,8 +202,10 @@ def sought(
     laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
     guessed = premises.knowledge not in ("exact", "identified")
     moved = numbers(problem, state, premises.changes) if guessed else []
-    # within what is known of them, or by an identification with a poorer motion, they are no finding
-    wrong = moved if (premises.knowledge, premises.scale) != (knowledge, 1.0) else []
+    # within what is known of them, or by an identification with a poorer motion, they are no finding; nor are
+    # they news beside recordings of reference, to which they were refitted with the others
+    beyond = (premises.knowledge, premises.scale) != (knowledge, 1.0)
+    wrong = moved if beyond and all(active) else []
     kept = transferable(problem, laws)
     if doubtful := stand_ins(problem, kept):
         kept = with_terms(problem, [t for t in kept.terms if all(t is not d for d in doubtful)])
@@ -235,7 +237,8 @@ def sought(
             corrected, fitted = correct(kept), fit(problem, kept)
         answer = verdict([f for f, on in zip(found, likely, strict=True) if on], fitted, more)
     if moved and not wrong:
-        notes.append(_refitted(arm, moved, knowledge))
+        why = "to recordings of reference too" if beyond else f"as “{knowledge}” allows"
+        notes.append(_refitted(arm, moved, why))
     left_out = [
         *(t for t, gone in zip(state.terms, lost, strict=True) if gone),
         *(t for t in background if all(t is not k for k in lasting)),
@@ -282,14 +285,14 @@ def sought(
     return made, corrected if moved else corrected.as_written
 
 
-def _refitted(arm: Arm, moved: Sequence[Finding], knowledge: knowledge_.Knowledge) -> str:
-    """A sentence about numbers of the model that are no finding."""
+def _refitted(arm: Arm, moved: Sequence[Finding], why: str) -> str:
+    """A sentence about numbers of the model that are no finding, and why."""
     each = []
     for f in moved:
         j = max(f.joints, key=lambda j: f.rms_torque[j])
         size = f"{f.rms_torque[j]:.3g} {arm.unit('N·m', j)} rms"
         each.append(f"{f.effect.replace('_', ' ')}, by up to {size} at joint {j + 1}")
-    return f"numbers of the model were refitted as “{knowledge}” allows: {'; '.join(each)}"
+    return f"numbers of the model were refitted {why}: {'; '.join(each)}"
 
 
 def _too_unsure(findings: Sequence[Finding]) -> str:
