@@ -19,11 +19,11 @@ from jaxpanda.recordings import load, save
 SECONDS, RATE = 12.0, 200.0
 NOISE = 0.03
 """Of tau; of tau_motor twice that [N m]."""
-COULOMB = np.array([0.8, 1.0, 0.0, 0.0, 0.0, 0.35, 0.0])
-VISCOUS = np.array([1.5, 2.0, 0.0, 0.0, 0.0, 0.6, 0.0])
-ROTORS = np.array([0.6, 0.6, 0.0, 0.0, 0.0, 0.2, 0.0])
+COULOMB = np.array([0.8, 0.0, 0.0, 0.0, 0.0, 0.35, 0.0])
+VISCOUS = np.array([1.5, 0.0, 0.0, 0.0, 0.0, 0.6, 0.0])
+ROTORS = np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0])
 LOSSY = np.flatnonzero(COULOMB)
-"""Joints whose drives lose torque; three, as the time of a diagnosis grows with what is missing."""
+"""Joints whose drives lose torque; two, as the time of a diagnosis grows with what is missing."""
 ARM = Arm.panda()
 LOAD = 1.2
 """Of the body at the flange [kg]."""
