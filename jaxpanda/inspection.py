@@ -21,6 +21,7 @@ MOVING = 0.01
 WEAK = 1e-3
 """Directions of parameter space that show this much less torque than the strongest one are weakly excited."""
 _STATES = 400  # of the motion, spread evenly, at which ranks are computed
+_PARTS, _UNSURE = 10, 0.25  # of the motion, and the deviation of a torque's scale beyond which it is not told
 
 
 @dataclasses.dataclass(frozen=True)
@@ -326,11 +327,16 @@ def _scales(j: int, signals: Signals, model: _States) -> tuple[float | None, flo
 
 
 def _factor(tau: np.ndarray, first: list[np.ndarray], others: list[np.ndarray]) -> float | None:
-    """The coefficient of `first[0]`; None unless what the other columns leave of it varies by 0.3 N m."""
+    """The coefficient of `first[0]`; None unless what the other columns leave of it varies by 0.3 N m, and parts
+    of the motion agree on it (a jackknife over `_PARTS`)."""
     columns = np.column_stack(first + others)
     rest = columns[:, 1:]
     alone = columns[:, 0] - rest @ np.linalg.lstsq(rest, columns[:, 0], rcond=None)[0]
     if np.std(alone) < 0.3:
+        return None
+    part = np.arange(len(tau)) * _PARTS // len(tau)
+    found = [np.linalg.lstsq(columns[part != k], tau[part != k], rcond=None)[0][0] for k in range(_PARTS)]
+    if np.sqrt(_PARTS - 1) * np.std(found) > _UNSURE:
         return None
     return float(np.linalg.lstsq(columns, tau, rcond=None)[0][0])
 

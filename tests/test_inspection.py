@@ -191,3 +191,18 @@ def test_the_log_of_gaz_et_al_is_what_the_notes_say(data):
     assert all(joint.torque_scale is None or 0.9 < joint.torque_scale < 1.1 for joint in found.joints)
     assert found.period == pytest.approx(13.3335, abs=1e-3)
     assert "gravity is in the torque" in said(found)
+
+
+def test_a_scale_that_parts_of_the_motion_disagree_on_is_not_told():
+    """A UR5's third joint, by its motor's current, had the wrong sign, and a Doosan's first another scale."""
+    recording, rng = virtual(), np.random.default_rng(0)
+    held = np.repeat(rng.normal(0, 8.0, 12), 250)  # as friction that a joint's rests leave behind
+    found = inspect(
+        dataclasses.replace(recording, tau=recording.tau + np.eye(7)[2] * held[:, None]), Arm.panda()
+    )
+    own = inspect(recording, Arm.panda())
+    assert own.joints[2].torque_scale == pytest.approx(1.0, abs=0.03)
+    assert found.joints[2].torque_scale is None
+    assert [j.torque_scale for j in found.joints[:2]] == [j.torque_scale for j in own.joints[:2]]
+    assert "scale" not in said(found)
+    assert "sign" not in said(found)
