@@ -21,7 +21,10 @@ MOVING = 0.01
 WEAK = 1e-3
 """Directions of parameter space that show this much less torque than the strongest one are weakly excited."""
 _STATES = 400  # of the motion, spread evenly, at which ranks are computed
-_PARTS, _UNSURE = 10, 0.25  # of the motion, and the deviation of a torque's scale beyond which it is not told
+_PARTS, _UNSURE = (
+    10,
+    0.25,
+)  # of the motion; deviation of a torque's scale, or its share, from which none is told
 
 
 @dataclasses.dataclass(frozen=True)
@@ -334,11 +337,11 @@ def _factor(tau: np.ndarray, first: list[np.ndarray], others: list[np.ndarray]) 
     alone = columns[:, 0] - rest @ np.linalg.lstsq(rest, columns[:, 0], rcond=None)[0]
     if np.std(alone) < 0.3:
         return None
+    whole = float(np.linalg.lstsq(columns, tau, rcond=None)[0][0])
     part = np.arange(len(tau)) * _PARTS // len(tau)
     found = [np.linalg.lstsq(columns[part != k], tau[part != k], rcond=None)[0][0] for k in range(_PARTS)]
-    if np.sqrt(_PARTS - 1) * np.std(found) > _UNSURE:
-        return None
-    return float(np.linalg.lstsq(columns, tau, rcond=None)[0][0])
+    agree = np.sqrt(_PARTS - 1) * np.std(found) < _UNSURE * max(1.0, abs(whole))
+    return whole if agree else None
 
 
 def _identifiable(
