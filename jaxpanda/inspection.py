@@ -21,10 +21,8 @@ MOVING = 0.01
 WEAK = 1e-3
 """Directions of parameter space that show this much less torque than the strongest one are weakly excited."""
 _STATES = 400  # of the motion, spread evenly, at which ranks are computed
-_PARTS, _UNSURE = (
-    10,
-    0.25,
-)  # of the motion; deviation of a torque's scale, or its share, from which none is told
+_PARTS = 10  # of the motion, that are to agree on a torque's scale
+_UNSURE = 0.25  # deviation of a scale, or its share of a large one, from which it is not told
 
 
 @dataclasses.dataclass(frozen=True)
@@ -337,10 +335,11 @@ def _factor(tau: np.ndarray, first: list[np.ndarray], others: list[np.ndarray]) 
     alone = columns[:, 0] - rest @ np.linalg.lstsq(rest, columns[:, 0], rcond=None)[0]
     if np.std(alone) < 0.3:
         return None
-    whole = float(np.linalg.lstsq(columns, tau, rcond=None)[0][0])
-    part = np.arange(len(tau)) * _PARTS // len(tau)
-    found = [np.linalg.lstsq(columns[part != k], tau[part != k], rcond=None)[0][0] for k in range(_PARTS)]
-    agree = np.sqrt(_PARTS - 1) * np.std(found) < _UNSURE * max(1.0, abs(whole))
+    scale = lambda rows: float(np.linalg.lstsq(columns[rows], tau[rows], rcond=None)[0][0])
+    everything = np.arange(len(tau))
+    whole = scale(everything)
+    without = [scale(np.delete(everything, part)) for part in np.array_split(everything, _PARTS)]
+    agree = np.sqrt(_PARTS - 1) * np.std(without) < _UNSURE * max(1.0, abs(whole))
     return whole if agree else None
 
 
