@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import regressor
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter1d
 
 from .arms.arm import Arm, unit_of
 from .errors import require_x64
@@ -21,7 +22,12 @@ MOVING = 0.01
 WEAK = 1e-3
 """Directions of parameter space that show this much less torque than the strongest one are weakly excited."""
 _STATES = 400  # of the motion, spread evenly, at which ranks are computed
+_NEAR = 0.1  # an arm rests where no joint moves within this time [s]
 _PARTS = 10  # of the motion, that are to agree on a torque's scale
+_UNTOLD = (
+    "torque's unit and sign cannot be told: the model's torque hardly varies over this motion, or parts of it "
+    "disagree"
+)
 _UNSURE = 0.25  # deviation of a scale, or its share of a large one, from which it is not told
 
 
@@ -47,7 +53,8 @@ class JointInspection:
     velocity_lag: float | None
     """By how much the logged dq is late behind d(q)/dt [s]."""
     torque_step: float | None
-    """Smallest difference between two torques: the sensor's resolution, or the file's [N m]."""
+    """Smallest difference between two torques: the sensor's resolution, or the file's; None where torque never
+    changes [N m]."""
     noise: float | None
     """Torque noise from sample to sample [N m]."""
     repeat_noise: float | None
@@ -244,7 +251,8 @@ def _joint(
     qd, qdd = signals.qd[inner, j], signals.qdd[inner, j]
     tau = recording.tau
     repeat = repeatability(signals)
-    torque_scale, gravity_scale = (None, None) if model is None or tau is None else _scales(j, signals, model)
+    step = None if tau is None else _step(tau[:, j])
+    scales = (None, None) if model is None or step is None else _scales(j, signals, model)
     return JointInspection(
         joint=j + 1,
         slides=slides,
@@ -255,11 +263,11 @@ def _joint(
         reversals=_reversals(qd),
         rest=float(np.mean(np.abs(qd) < MOVING)),
         velocity_lag=_velocity_lag(j, recording, signals),
-        torque_step=None if tau is None else _step(tau[:, j]),
+        torque_step=step,
         noise=None if tau is None else float(white_noise(tau)[j]),
         repeat_noise=None if repeat is None else float(repeat[j]),
-        torque_scale=torque_scale,
-        gravity_scale=gravity_scale,
+        torque_scale=scales[0],
+        gravity_scale=scales[1],
     )
 
 
@@ -294,11 +302,18 @@ def _velocity_lag(j: int, recording: Recording, signals: Signals) -> float | Non
 
 def _states(arm: Arm, signals: Signals) -> _States:
     places = np.linspace(0, len(signals.keep) - 1, _STATES).astype(int)
-    q, qd, qdd = (x[signals.keep[places]] for x in (signals.q, signals.qd, signals.qdd))
+    moving = _moving(signals)[:, None]
+    q, qd, qdd = (x[signals.keep[places]] for x in (signals.q, signals.qd * moving, signals.qdd * moving))
     Y, Y_gravity = _stacked(arm, q, qd, qdd), _stacked(arm, q, 0 * q, 0 * q)
     phi = np.asarray(arm.standard).ravel()
     known = np.asarray(jax.vmap(arm.known_torque)(*map(jnp.asarray, (q, qd, qdd))))
     return _States(places, Y, Y_gravity, Y @ phi + known, Y_gravity @ phi)
+
+
+def _moving(signals: Signals) -> Bool[np.ndarray, " time"]:
+    """Where some joint moves: elsewhere speed and acceleration are noise of q."""
+    reach = 2 * round(_NEAR * signals.rate) + 1
+    return maximum_filter1d(np.any(np.abs(signals.qd) > MOVING, axis=1), reach)
 
 
 def _stacked(
@@ -440,15 +455,26 @@ def _unit_verdicts(found: Inspection, arm: Arm | None) -> list[str]:
 def _torque_verdicts(found: Inspection, arm: Arm | None, read: Meaning | None) -> list[str]:
     if "tau" not in found.channels:
         return ["no torque: a motion, which can be predicted for but not identified from"]
+    dead = _dead_verdicts(found)
     if arm is None:
-        return ["torque's unit and sign cannot be told without a model"]
+        return [*dead, "torque's unit and sign cannot be told without a model"]
     if read is not None:
-        return [read.summary]
-    said = []
+        return [*dead, read.summary]
     scales = {joint.joint: joint.torque_scale for joint in found.joints if joint.torque_scale is not None}
-    gravity = {joint.joint: joint.gravity_scale for joint in found.joints if joint.gravity_scale is not None}
-    if not scales:
-        return ["torque's unit and sign cannot be told: the model's torque hardly varies over this motion"]
+    gravity = [joint.gravity_scale for joint in found.joints if joint.gravity_scale is not None]
+    said = dead + (_scale_verdicts(found, scales) if scales else [_UNTOLD])
+    if gravity:
+        weight = float(np.median(gravity))
+        if abs(weight) < 0.3:
+            said.append(f"gravity is not in the torque ({weight:.2f} times the model's): add it back")
+        elif weight > 0:
+            said.append(f"gravity is in the torque: {weight:.2f} times the model's")
+    return said
+
+
+def _scale_verdicts(found: Inspection, scales: dict[int, float]) -> list[str]:
+    """Signs, unit and joints that are unlike the others, by each joint's scale."""
+    said = []
     reversed_ = [joint for joint, k in scales.items() if k < -0.3]
     if reversed_:
         said.append(
@@ -471,13 +497,13 @@ def _torque_verdicts(found: Inspection, arm: Arm | None, read: Meaning | None) -
             f"torque in {found.unit('N m')}, positive along the joint axis: {min(scales.values()):.2f} to "
             f"{max(scales.values()):.2f} times the model's"
         )
-    if gravity:
-        weight = float(np.median(list(gravity.values())))
-        if abs(weight) < 0.3:
-            said.append(f"gravity is not in the torque ({weight:.2f} times the model's): add it back")
-        elif weight > 0:
-            said.append(f"gravity is in the torque: {weight:.2f} times the model's")
     return said
+
+
+def _dead_verdicts(found: Inspection) -> list[str]:
+    """Torque that never changes."""
+    dead = [joint.joint for joint in found.joints if joint.torque_step is None]
+    return [f"torque of joints {_listed(dead)} never changes: no sensor speaks there"] if dead else []
 
 
 def _declared_verdicts(found: Inspection) -> list[str]:

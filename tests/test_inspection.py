@@ -206,3 +206,27 @@ def test_a_scale_that_parts_of_the_motion_disagree_on_is_not_told():
     assert [j.torque_scale for j in found.joints[:2]] == [j.torque_scale for j in own.joints[:2]]
     assert "scale" not in said(found)
     assert "sign" not in said(found)
+
+
+def test_a_torque_that_never_changes_has_no_scale():
+    recording = virtual()
+    found = inspect(
+        dataclasses.replace(recording, tau=np.where(np.eye(7)[1], 5.0, recording.tau)), Arm.panda()
+    )
+    assert found.joints[1].torque_scale is None
+    assert found.joints[1].gravity_scale is None
+    assert "torque of joints 2 never changes: no sensor speaks there" in said(found)
+    dead = inspect(dataclasses.replace(recording, tau=5.0 + 0 * recording.q), Arm.panda())
+    assert "times what the model needs" not in said(dead)
+
+
+def test_an_arm_at_rest_has_no_scale_and_no_inertia():
+    """Noise of q, differentiated twice, is no motion: a Doosan at rest had 0.0002 times its model's torque."""
+    recording, rng = virtual(), np.random.default_rng(0)
+    q = recording.q[:1] + rng.normal(0, 1e-5, recording.q.shape)
+    tau = recording.tau[:1] + rng.normal(0, 0.1, recording.q.shape)
+    found = inspect(dataclasses.replace(recording, q=q, qd=None, tau=tau), Arm.panda())
+    assert [joint.torque_scale for joint in found.joints] == [None] * 7
+    assert "unit and sign cannot be told" in said(found)
+    assert found.identifiable is not None
+    assert found.identifiable.rank == found.identifiable.gravity_rank
