@@ -43,6 +43,8 @@ MET = 1e-14
 """Share of the right-hand side's square that counts as nothing left."""
 
 _TO_BOUNDARY = 0.95
+_CENTRING = 6  # the target is mu times what the predictor leaves of the gap, to this power
+_FIRST = 0.1  # mu at first, over what would make the gap all of the objective
 _LEAST_DAMPING, _SLIGHT_DAMPING = 1e-12, 1e-3
 _NEARNESS = 150.0  # kappa: how much an end resembles its start, where the optimum leaves that open
 _WEIGHT = 3.0  # of what is not linear, at first; in its units
@@ -296,7 +298,7 @@ def initialise(
         steps=fresh,
         done=jnp.zeros(lanes, bool),
     )
-    mu = _evaluate(problem, u, state).objective / _order(problem)
+    mu = _FIRST * _evaluate(problem, u, state).objective / _order(problem)
     return eqx.tree_at(lambda s: (s.Z, s.z, s.pulled), state, (mu * state.Z, mu * state.z, mu))
 
 
@@ -335,7 +337,9 @@ def step(problem: Problem, state: State, most: int) -> State:
         alpha = _TO_BOUNDARY * alpha
         left = small.inner(S + alpha * dS, state.Z + alpha * dZ)
         left = left + jnp.sum((s + alpha * ds) * (state.z + alpha * dz), 0)
-        target = corrects * jnp.maximum(mu * jnp.clip((left / gap) ** 3, 1e-4, 1.0), 0.01 * solved / order)
+        target = corrects * jnp.maximum(
+            mu * jnp.clip((left / gap) ** _CENTRING, 1e-4, 1.0), 0.01 * solved / order
+        )
         of_S = target * S_inverse - small.symmetric_part(small.product(small.product(S_inverse, dS), dZ))
         of_s = (target - ds * dz) / s
         rhs = G.T @ of_s - gradient - target * away
