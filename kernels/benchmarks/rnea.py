@@ -4,7 +4,7 @@
     python kernels/benchmarks/rnea.py --baseline           # and replaces the committed baseline
     python kernels/benchmarks/rnea.py --gpu --batch 16777215          # ours on a GPU, and the plain definition
     python kernels/benchmarks/rnea.py --gpu --mjx --batch 16777215    # and mjx.inverse at batch 1e6
-    python kernels/benchmarks/rnea.py --gpu --warp --batch 16777215   # and mujoco_warp.inverse
+    python kernels/benchmarks/rnea.py --gpu --batch 16777215 --peers mujoco_warp newton frax   # and theirs
 
 One process for each number of cores, bound to them before anything starts; warm-up first; contenders take
 turns, so that a busy machine is unfair to all of them; results are waited for, on a GPU those of eight calls
@@ -30,6 +30,7 @@ import time
 from collections.abc import Callable, Iterator
 from importlib import metadata, util
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).parent
 BASELINE = HERE / "rnea.json"
@@ -78,7 +79,19 @@ def build_peers(folder: Path, extra: list[str]) -> dict[str, str]:
 
 
 WORLDS = 8_192, 32_768, 131_072
-"""Of MuJoCo Warp, which is made for thousands of them: its best is to be told."""
+"""Of engines on Warp, which are made for thousands of them: their best is to be told."""
+MODELS = """
+import sys, pathlib
+from jaxpanda.arms.arm import Arm
+from jaxpanda.arms.export import panda_mjcf
+from jaxpanda.arms.urdf import to_urdf
+folder = pathlib.Path(sys.argv[1])
+(folder / "panda.xml").write_text(panda_mjcf())
+body = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+urdf = to_urdf(Arm.panda()).replace('<link name="base_link"/>', f'<link name="base_link">{body}</link>')
+(folder / "panda.urdf").write_text(urdf)
+"""
+"""Writes the Panda for the peers; frax reads no base without inertia."""
 Contender = Callable[[], tuple[float, float]]
 """Runs once; nanoseconds an evaluation of wall time and of process time."""
 
@@ -253,40 +266,121 @@ def mjx(folder: Path, batch: int, note: Callable[[str, float], None]) -> dict[st
     return {name: timed(lambda: jax.block_until_ready(torque(*states)), batch)}
 
 
-def warp(folder: Path, note: Callable[[str, float], None]) -> dict[str, Contender]:
-    """MuJoCo Warp's inverse dynamics, its launches recorded once in a CUDA graph, as its documentation has it."""
+def known_torque(folder: Path) -> tuple[Any, Any]:
+    """The model, and MuJoCo's inverse dynamics of all joints at 0.3 rad, 0.2 rad/s and 0.1 rad/s²."""
     import mujoco
-    import mujoco_warp
-    import numpy as np
-    import warp as wp
 
     model = mujoco.MjModel.from_xml_path(str(folder / "panda.xml"))
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
     known = mujoco.MjData(model)
     known.qpos[:], known.qvel[:], known.qacc[:] = 0.3, 0.2, 0.1
     mujoco.mj_inverse(model, known)
+    return model, known.qfrc_inverse
+
+
+def recorded(launch: Callable[[], object], tau: Any, known: Any, worlds: int) -> tuple[float, Contender]:
+    """Seconds of the first call, and calls of it by a CUDA graph, as Warp's documentation has it."""
+    import numpy as np
+    import warp as wp
+
+    start = time.perf_counter()
+    launch()
+    wp.synchronize()
+    first = time.perf_counter() - start
+    np.testing.assert_allclose(
+        tau.numpy().reshape(worlds, -1), np.tile(known, (worlds, 1)), rtol=1e-3, atol=1e-3
+    )
+    with wp.ScopedCapture() as capture:
+        launch()
+
+    def calls(keeps: object = launch) -> None:  # the arrays that the graph has recorded
+        for _ in range(8):
+            wp.capture_launch(capture.graph)
+        wp.synchronize()
+
+    return first, timed(calls, 8 * worlds)
+
+
+def mujoco_warp(folder: Path, note: Callable[[str, float], None]) -> dict[str, Contender]:
+    """MuJoCo Warp's inverse dynamics."""
+    import mujoco_warp
+
+    model, known = known_torque(folder)
     device, contenders = mujoco_warp.put_model(model), {}
     for worlds in WORLDS:
         states = mujoco_warp.make_data(model, nworld=worlds, nconmax=1, njmax=1)
-        for state in ("qpos", "qvel", "qacc"):
-            getattr(states, state).fill_(float(getattr(known, state)[0]))
-        start = time.perf_counter()
-        mujoco_warp.inverse(device, states)
-        wp.synchronize()
+        for state, value in (("qpos", 0.3), ("qvel", 0.2), ("qacc", 0.1)):
+            getattr(states, state).fill_(value)
         name = f"rnea, mujoco_warp.inverse of {worlds} worlds, float32"
-        note(name, time.perf_counter() - start)
-        torque = states.qfrc_inverse.numpy()
-        np.testing.assert_allclose(torque, np.tile(known.qfrc_inverse, (worlds, 1)), rtol=1e-3, atol=1e-3)
-        with wp.ScopedCapture() as recorded:
-            mujoco_warp.inverse(device, states)
-
-        def calls(states=states, graph=recorded.graph) -> None:
-            for _ in range(8):
-                wp.capture_launch(graph)
-            wp.synchronize()
-
-        contenders[name] = timed(calls, 8 * worlds)
+        launch = functools.partial(mujoco_warp.inverse, device, states)
+        first, contenders[name] = recorded(launch, states.qfrc_inverse, known, worlds)
+        note(name, first)
     return contenders
+
+
+def newton(folder: Path, note: Callable[[str, float], None]) -> dict[str, Contender]:
+    """Newton's: mass matrix, Coriolis and gravity force, and their sum; no recursion has accelerations."""
+    import newton
+    import warp as wp
+
+    _, known = known_torque(folder)
+    arm, contenders = newton.ModelBuilder(), {}
+    arm.add_mjcf(str(folder / "panda.xml"), enable_self_collisions=False)
+    for worlds in WORLDS:
+        scene = newton.ModelBuilder()
+        scene.replicate(arm, worlds)
+        model = scene.finalize()
+        state = model.state()
+        state.joint_q.fill_(0.3)
+        state.joint_qd.fill_(0.2)
+        count, dof = model.articulation_count, model.max_dofs_per_articulation
+        M = wp.zeros((count, dof, dof), dtype=float)
+        gravity, coriolis, tau, qdd = (wp.zeros(model.joint_dof_count, dtype=float) for _ in range(4))
+        qdd.fill_(0.1)
+
+        def launch(model=model, state=state, M=M, g=gravity, c=coriolis, tau=tau, qdd=qdd) -> None:
+            newton.eval_fk(model, state.joint_q, state.joint_qd, state)
+            newton.eval_inverse_dynamics_passive(
+                model, state, mass_matrix=M, gravity_force=g, coriolis_force=c
+            )
+            newton.eval_inverse_dynamics_force(
+                model, state, mass_matrix=M, joint_qdd=qdd, coriolis_force=c, gravity_force=g, joint_f=tau
+            )
+
+        name = f"rnea, newton's of {worlds} worlds, float32"
+        first, contenders[name] = recorded(launch, tau, known, worlds)
+        note(name, first)
+    return contenders
+
+
+def frax(folder: Path, note: Callable[[str, float], None]) -> dict[str, Contender]:
+    """frax's, vmapped, of a batch as large as MJX's."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    from frax.core.robot import Robot
+
+    _, known = known_torque(folder)
+    robot, batch = Robot(str(folder / "panda.urdf")), 1_000_000
+    up = jnp.asarray([0, 0, 9.81, 0, 0, 0], jnp.float32)
+    torque = jax.jit(jax.vmap(lambda q, qd, qdd: robot.rnea(q, qd, qdd, up, None)))
+    states = [s * jnp.ones((batch, 7), jnp.float32) for s in (0.3, 0.2, 0.1)]
+    start = time.perf_counter()
+    found = jax.block_until_ready(torque(*states))
+    name = f"rnea, frax vmapped over {batch}, float32"
+    note(name, time.perf_counter() - start)
+    np.testing.assert_allclose(found[0], known, rtol=5e-3, atol=1e-3)  # its products are of TF32
+
+    def calls() -> None:
+        for _ in range(7):
+            torque(*states)
+        jax.block_until_ready(torque(*states))
+
+    return {name: timed(calls, 8 * batch)}
+
+
+PEERS = {"mujoco_warp": mujoco_warp, "newton": newton, "frax": frax}
+"""Of a GPU, by their packages; each in a process of its own, as JAX keeps most of a card's memory."""
 
 
 def measure(cores: int, batch: int, rounds: int, folder: Path) -> dict:
@@ -299,8 +393,8 @@ def measure(cores: int, batch: int, rounds: int, folder: Path) -> dict:
         compilation[name] = seconds
         print(f"{name}: first call {seconds:.1f} s", file=sys.stderr, flush=True)
 
-    if (folder / "warp").exists():
-        return rows_of(warp(folder, note), rounds, compilation)
+    if (folder / "peer").exists():
+        return rows_of(PEERS[(folder / "peer").read_text()](folder, note), rounds, compilation)
     contenders = ours(batch, note, all_forms=cores != 1)
     if cores == 1:
         contenders |= pinocchio_loops(folder)
@@ -345,7 +439,18 @@ def rows_of(contenders: dict[str, Contender], rounds: int, compilation: dict[str
 
 
 def machine() -> dict:
-    names = ["jax", "jaxlib", "pin", "mujoco", "mujoco-mjx", "mujoco-warp", "warp-lang", "numpy"]
+    names = [
+        "jax",
+        "jaxlib",
+        "pin",
+        "mujoco",
+        "mujoco-mjx",
+        "mujoco-warp",
+        "warp-lang",
+        "newton",
+        "frax",
+        "numpy",
+    ]
     versions = {}
     for name in names:
         try:
@@ -391,6 +496,8 @@ RATIOS = [
     (0, "rnea, plain definition, float32", "rnea, columns, float32", 10),
     (0, "rnea, mjx.inverse vmapped over 1000000, float32", "rnea, columns, float32", 200),
     *((0, f"rnea, mujoco_warp.inverse of {n} worlds, float32", "rnea, columns, float32", 10) for n in WORLDS),
+    *((0, f"rnea, newton's of {n} worlds, float32", "rnea, columns, float32", 10) for n in WORLDS),
+    (0, "rnea, frax vmapped over 1000000, float32", "rnea, columns, float32", 10),
 ]
 
 
@@ -402,15 +509,16 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--gpu", action="store_true", help="measure JAX's GPU in place of the processor")
     parser.add_argument("--mjx", action="store_true", help="on a GPU: mjx.inverse beside it, at batch 1e6")
-    parser.add_argument("--warp", action="store_true", help="on a GPU: mujoco_warp.inverse beside it")
+    parser.add_argument("--peers", nargs="*", default=[], choices=PEERS, help="on a GPU: these beside it")
     parser.add_argument(
         "--include", action="append", default=[], help="folder of further C++ headers (Eigen)"
     )
     parser.add_argument("--baseline", action="store_true", help=f"replace {BASELINE.name}")
     parser.add_argument("--child", nargs=2, metavar=("CORES", "FOLDER"), help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.warp and not (args.gpu and util.find_spec("mujoco_warp")):
-        parser.error("--warp needs --gpu and the package mujoco-warp")
+    absent = [peer for peer in args.peers if not (args.gpu and util.find_spec(peer))]
+    if absent:
+        parser.error(f"--peers needs --gpu and the packages {', '.join(absent)}")
     if args.child:
         print(json.dumps(measure(int(args.child[0]), args.batch, args.rounds, Path(args.child[1]))))
         return
@@ -420,12 +528,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         reasons = {}
-        if args.mjx or args.warp or not args.gpu:
+        if args.mjx or args.peers or not args.gpu:
             # in a process of its own, and on the processor: JAX keeps most of a card's memory
-            code = "from jaxpanda.arms.export import panda_mjcf; print(panda_mjcf())"
             on_host = {**os.environ, "JAX_PLATFORMS": "cpu"}
-            with (folder / "panda.xml").open("w") as file:
-                subprocess.run([sys.executable, "-c", code], stdout=file, env=on_host, check=True)
+            subprocess.run([sys.executable, "-c", MODELS, name], env=on_host, check=True)
         if args.mjx:
             (folder / "mjx").touch()
         if not args.gpu:
@@ -435,8 +541,8 @@ def main() -> None:
             command += ["--batch", str(args.batch), "--rounds", str(args.rounds)]
             child = functools.partial(subprocess.run, command, stdout=subprocess.PIPE, text=True, check=True)
             rows = json.loads(child().stdout.splitlines()[-1])
-            if args.warp:  # when JAX has given the card's memory back
-                (folder / "warp").touch()
+            for peer in args.peers:
+                (folder / "peer").write_text(peer)
                 rows |= json.loads(child().stdout.splitlines()[-1])
             result["gpu" if cores == 0 else f"cores {cores}"] = rows
             show("on a GPU" if cores == 0 else f"on {cores} core(s)", rows)
