@@ -1,13 +1,13 @@
 """What a recording is, what speaks for its units and signs, and what can be identified from it."""
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxpanda_kernels import regressor
-from jaxtyping import Bool, Float, Int
+from jaxpanda_kernels import gravity_torque, regressor
+from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import maximum_filter1d
 
 from .arms.arm import Arm, unit_of
@@ -303,11 +303,36 @@ def _velocity_lag(j: int, recording: Recording, signals: Signals) -> float | Non
 def _states(arm: Arm, signals: Signals) -> _States:
     places = np.linspace(0, len(signals.keep) - 1, _STATES).astype(int)
     moving = _moving(signals)[:, None]
-    q, qd, qdd = (x[signals.keep[places]] for x in (signals.q, signals.qd * moving, signals.qdd * moving))
-    Y, Y_gravity = _stacked(arm, q, qd, qdd), _stacked(arm, q, 0 * q, 0 * q)
-    phi = np.asarray(arm.standard).ravel()
-    known = np.asarray(jax.vmap(arm.known_torque)(*map(jnp.asarray, (q, qd, qdd))))
-    return _States(places, Y, Y_gravity, Y @ phi + known, Y_gravity @ phi)
+    qd, qdd = signals.qd * moving, signals.qdd * moving
+    Y, Y_gravity = (
+        _stacked(arm, *(x[signals.keep[places]] for x in states))
+        for states in ((signals.q, qd, qdd), (signals.q, 0 * qd, 0 * qdd))
+    )
+    torque = _low_passed(_torques, arm, (signals.q, qd, qdd), signals)[places]
+    gravity = _low_passed(_gravity, arm, (signals.q,), signals)[places]
+    return _States(places, Y, Y_gravity, torque, gravity)
+
+
+def _low_passed(
+    of: Callable[..., Array], arm: Arm, states: Sequence[Float[np.ndarray, "time dof"]], signals: Signals
+) -> Float[np.ndarray, "kept dof"]:
+    """The model's torque low-passed as the measured one [N m]: what noise of q makes of it is mostly faster."""
+    thin = max(1, int(signals.rate / (4 * signals.derivative_cutoff)))  # no motion is faster
+    some = [x[::thin] for x in states]
+    blocks = zip(*map(_blocks, some), strict=True)
+    torque = np.concatenate([np.asarray(of(arm, *block)) for block in blocks])[: len(some[0])]
+    torque = zero_phase(torque, signals.cutoff, signals.rate / thin)
+    return np.stack([np.interp(signals.times, signals.time[::thin], column) for column in torque.T], 1)
+
+
+def _blocks(x: Float[np.ndarray, "time dof"]) -> list[Float[np.ndarray, "block dof"]]:
+    """Of one length, which one compilation serves; the last row fills the last one."""
+    x = np.pad(x, ((0, -len(x) % _STATES), (0, 0)), "edge")
+    return np.split(x, len(x) // _STATES)
+
+
+_torques = jax.jit(jax.vmap(lambda arm, q, qd, qdd: arm.inverse_dynamics(q, qd, qdd), (None, 0, 0, 0)))
+_gravity = jax.jit(jax.vmap(lambda arm, q: gravity_torque(arm.chain, arm.standard, q), (None, 0)))
 
 
 def _moving(signals: Signals) -> Bool[np.ndarray, " time"]:

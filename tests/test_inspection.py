@@ -230,3 +230,13 @@ def test_an_arm_at_rest_has_no_scale_and_no_inertia():
     assert "unit and sign cannot be told" in said(found)
     assert found.identifiable is not None
     assert found.identifiable.rank == found.identifiable.gravity_rank
+
+
+def test_noise_of_q_makes_no_scale_smaller():
+    """The model's torque is low-passed as the measured one is: a UR10e's first joint had 0.40 of its model's."""
+    recording, rng = virtual(), np.random.default_rng(0)
+    q = recording.q + rng.normal(0, 3e-4, recording.q.shape)
+    found = inspect(dataclasses.replace(recording, q=q, qd=None), Arm.panda())
+    heavy = [found.joints[j] for j in (0, 1, 2, 3, 5)]
+    assert [joint.torque_scale for joint in heavy] == pytest.approx([1.0] * 5, abs=0.01)
+    assert [joint.gravity_scale for joint in heavy[1:]] == pytest.approx([1.0] * 4, abs=0.01)
