@@ -360,9 +360,10 @@ def _scales(j: int, signals: Signals, model: _States) -> tuple[float | None, flo
     Friction and an offset are fitted along. None where the torque at hand does not vary enough to tell.
     """
     assert signals.tau is not None
-    tau = signals.lowpass(signals.tau[:, j])[model.places]
-    qd = signals.qd[signals.keep[model.places], j]
-    others = [qd, np.tanh(qd / 0.05), np.ones_like(qd)]
+    qd = signals.qd[:, j]
+    both = np.stack([signals.tau[:, j], qd, np.tanh(qd / 0.05)], 1)
+    tau, *friction = signals.lowpass(both)[model.places].T
+    others = [*friction, np.ones_like(tau)]
     torque, gravity = model.torque[:, j], model.gravity[:, j]
     return _factor(tau, [torque], others), _factor(tau, [gravity, torque - gravity], others)
 
