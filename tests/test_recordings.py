@@ -315,7 +315,18 @@ def _npz(tmp_path, **arrays):
         ({"q": np.full((200, 3), None)}, "no plain arrays"),
         ({"time": np.zeros(0)} | dict.fromkeys(("q", "dq", "tau"), np.zeros((0, 3))), "too short, 0 rows"),
         ({"q": np.full((200, 3), "1")}, "where real numbers are needed"),
-        ({"tau": np.full((200, 3), np.nan)}, "column tau_1, row 1: the value is nan and 199 more"),
+        (
+            {"tau": np.r_[np.full((199, 3), np.nan), np.zeros((1, 3))]},
+            "column tau_1, row 1: the value is nan and 198",
+        ),
+        (
+            {"tau": np.tile([0, np.nan, 0], (200, 1))},
+            "column tau_2: no row has a number, .* none: --columns tau= ",
+        ),
+        (
+            {"q": np.full((200, 3), np.nan)},
+            "column q_1: no row has a number, where every joint's are needed$",
+        ),
     ],
 )
 def test_archives_with_wrong_arrays_are_refused(tmp_path, change, message):

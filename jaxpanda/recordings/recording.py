@@ -100,6 +100,11 @@ class Recording:
     def _require_finite(self, row: Callable[[int], str]) -> None:
         for name, column in self.columns():
             bad = np.flatnonzero(~np.isfinite(column))
+            channel = name.rpartition("_")[0]
+            if channel and bad.size and np.isnan(column).all():
+                without = "" if channel == "q" else f", or none: --columns {channel}= leaves the channel out"
+                what = "no row has a number, where every joint's are needed"
+                raise InputError(f"{self.name}: column {name}: {what}{without}")
             if bad.size:
                 more = f" and {bad.size - 1} more below it" if bad.size > 1 else ""
                 raise InputError(
