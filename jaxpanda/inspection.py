@@ -1,7 +1,6 @@
 """What a recording is, what speaks for its units and signs, and what can be identified from it."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,6 +15,7 @@ from .meaning import Meaning, meaning
 from .recordings import Origin, Recording
 from .recordings.checks import velocity_scale
 from .signals import LONGEST_GAP, Signals, prepare, repeatability, white_noise, zero_phase
+from .xla import chunked
 
 MOVING = 0.01
 """Below this a joint rests [rad/s]."""
@@ -301,38 +301,25 @@ def _velocity_lag(j: int, recording: Recording, signals: Signals) -> float | Non
 
 
 def _states(arm: Arm, signals: Signals) -> _States:
+    """Both torques are low-passed as the measured one: what noise of q makes of them is mostly faster."""
     places = np.linspace(0, len(signals.keep) - 1, _STATES).astype(int)
     moving = _moving(signals)[:, None]
-    qd, qdd = signals.qd * moving, signals.qdd * moving
-    Y, Y_gravity = (
-        _stacked(arm, *(x[signals.keep[places]] for x in states))
-        for states in ((signals.q, qd, qdd), (signals.q, 0 * qd, 0 * qdd))
+    q, qd, qdd = signals.q, signals.qd * moving, signals.qdd * moving
+    torque = arm.inverse_dynamics_of_many(q, qd, qdd)
+    gravity = chunked(_gravity, arm.nameless, q)
+    q, qd, qdd = (x[signals.keep[places]] for x in (q, qd, qdd))
+    return _States(
+        places,
+        _stacked(arm, q, qd, qdd),
+        _stacked(arm, q, 0 * q, 0 * q),
+        signals.lowpass(torque)[places],
+        signals.lowpass(gravity)[places],
     )
-    torque = _low_passed(_torques, arm, (signals.q, qd, qdd), signals)[places]
-    gravity = _low_passed(_gravity, arm, (signals.q,), signals)[places]
-    return _States(places, Y, Y_gravity, torque, gravity)
 
 
-def _low_passed(
-    of: Callable[..., Array], arm: Arm, states: Sequence[Float[np.ndarray, "time dof"]], signals: Signals
-) -> Float[np.ndarray, "kept dof"]:
-    """The model's torque low-passed as the measured one [N m]: what noise of q makes of it is mostly faster."""
-    thin = max(1, int(signals.rate / (4 * signals.derivative_cutoff)))  # no motion is faster
-    some = [x[::thin] for x in states]
-    blocks = zip(*map(_blocks, some), strict=True)
-    torque = np.concatenate([np.asarray(of(arm, *block)) for block in blocks])[: len(some[0])]
-    torque = zero_phase(torque, signals.cutoff, signals.rate / thin)
-    return np.stack([np.interp(signals.times, signals.time[::thin], column) for column in torque.T], 1)
-
-
-def _blocks(x: Float[np.ndarray, "time dof"]) -> list[Float[np.ndarray, "block dof"]]:
-    """Of one length, which one compilation serves; the last row fills the last one."""
-    x = np.pad(x, ((0, -len(x) % _STATES), (0, 0)), "edge")
-    return np.split(x, len(x) // _STATES)
-
-
-_torques = jax.jit(jax.vmap(lambda arm, q, qd, qdd: arm.inverse_dynamics(q, qd, qdd), (None, 0, 0, 0)))
-_gravity = jax.jit(jax.vmap(lambda arm, q: gravity_torque(arm.chain, arm.standard, q), (None, 0)))
+@jax.jit
+def _gravity(arm: Arm, q: Array) -> Array:
+    return jax.vmap(gravity_torque, (None, None, 0))(arm.chain, arm.standard, q)
 
 
 def _moving(signals: Signals) -> Bool[np.ndarray, " time"]:
@@ -361,8 +348,8 @@ def _scales(j: int, signals: Signals, model: _States) -> tuple[float | None, flo
     """
     assert signals.tau is not None
     qd = signals.qd[:, j]
-    both = np.stack([signals.tau[:, j], qd, np.tanh(qd / 0.05)], 1)
-    tau, *friction = signals.lowpass(both)[model.places].T
+    channels = np.stack([signals.tau[:, j], qd, np.tanh(qd / 0.05)], 1)
+    tau, *friction = signals.lowpass(channels)[model.places].T
     others = [*friction, np.ones_like(tau)]
     torque, gravity = model.torque[:, j], model.gravity[:, j]
     return _factor(tau, [torque], others), _factor(tau, [gravity, torque - gravity], others)

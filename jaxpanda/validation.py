@@ -40,7 +40,7 @@ from .errors import InputError, require_x64
 from .friction import Friction
 from .recordings import Recording
 from .signals import Signals, derivatives, prepare, zero_phase
-from .xla import chunked, options
+from .xla import options
 
 FILE = "validation.json"
 KIND = files.Kind("validate", (FILE,))
@@ -403,12 +403,7 @@ def _relative(errors: np.ndarray, measured: np.ndarray) -> float:
 
 def _kernel_inverse(arm: Arm, q, qd, qdd) -> Float[np.ndarray, "time dof"]:
     smooth = dataclasses.replace(arm, frictionloss=jnp.zeros(arm.dof))
-    return chunked(_inverse_dynamics, smooth.nameless, q, qd, qdd)
-
-
-@jax.jit
-def _inverse_dynamics(arm: Arm, q, qd, qdd):
-    return jax.vmap(arm.inverse_dynamics)(q, qd, qdd)
+    return smooth.inverse_dynamics_of_many(q, qd, qdd)
 
 
 @own_log()
@@ -494,7 +489,7 @@ def torque_rmse(arm: Arm, recordings: Sequence[Recording], cutoff: float = 5.0) 
 
 def _torque_error(arm: Arm, friction: Friction | None, signals: Signals) -> TorqueError:
     assert signals.tau is not None
-    tau = chunked(_inverse_dynamics, arm.nameless, signals.q, signals.qd, signals.qdd)
+    tau = arm.inverse_dynamics_of_many(signals.q, signals.qd, signals.qdd)
     if friction is not None:
         tau = tau + np.asarray(friction.torque(jnp.asarray(signals.qd)))
     measured, modelled = signals.lowpass(signals.tau), signals.lowpass(tau)

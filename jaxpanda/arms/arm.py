@@ -4,11 +4,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxpanda_kernels import Chain, rnea
 from jaxtyping import Array, Float
 
+from ..xla import chunked
 from .mjcf import KNOWN, parts_of, read
 from .model_file import Model
 from .panda import published_parts
@@ -151,6 +153,21 @@ class Arm(eqx.Module):
     ) -> Float[Array, " dof"]:
         """Joint torque [N m] of a motion under the model as it is."""
         return rnea(self.chain, self.standard, q, qd, qdd) + self.known_torque(q, qd, qdd)
+
+    def inverse_dynamics_of_many(
+        self,
+        q: Float[np.ndarray, "time dof"],
+        qd: Float[np.ndarray, "time dof"],
+        qdd: Float[np.ndarray, "time dof"],
+    ) -> Float[np.ndarray, "time dof"]:
+        """`inverse_dynamics` of many states, compiled once for any number of them and for all arms of as many
+        joints."""
+        return chunked(_inverse_dynamics, self.nameless, q, qd, qdd)
+
+
+@jax.jit
+def _inverse_dynamics(arm: Arm, q: Array, qd: Array, qdd: Array) -> Array:
+    return jax.vmap(arm.inverse_dynamics)(q, qd, qdd)
 
 
 _CHAIN = ("R", "p", "prismatic", "gravity")

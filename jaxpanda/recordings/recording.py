@@ -100,17 +100,18 @@ class Recording:
     def _require_finite(self, row: Callable[[int], str]) -> None:
         for name, column in self.columns():
             bad = np.flatnonzero(~np.isfinite(column))
+            if not bad.size:
+                continue
             channel = name.rpartition("_")[0]
-            if channel and bad.size and np.isnan(column).all():
+            if channel and np.isnan(column).all():
                 without = "" if channel == "q" else f", or none: --columns {channel}= leaves the channel out"
                 what = "no row has a number, where every joint's are needed"
                 raise InputError(f"{self.name}: column {name}: {what}{without}")
-            if bad.size:
-                more = f" and {bad.size - 1} more below it" if bad.size > 1 else ""
-                raise InputError(
-                    f"{self.name}: column {name}, {row(int(bad[0]))}: the value is {column[bad[0]]}{more}, "
-                    "where a finite number is needed; leave out the rows that were not measured"
-                )
+            more = f" and {bad.size - 1} more below it" if bad.size > 1 else ""
+            raise InputError(
+                f"{self.name}: column {name}, {row(int(bad[0]))}: the value is {column[bad[0]]}{more}, "
+                "where a finite number is needed; leave out the rows that were not measured"
+            )
 
     def _require_order(self, row: Callable[[int], str]) -> None:
         back = np.flatnonzero(np.diff(self.time) <= 0)

@@ -118,14 +118,21 @@ def copied(batch: int, rounds: int) -> float:
     big, f = jnp.ones(words, jnp.float32), jax.jit(lambda x: x + 1)
     jax.block_until_ready(f(big))
 
-    def several() -> None:
-        for _ in range(calls - 1):
-            f(big)
-        jax.block_until_ready(f(big))
-
-    run = timed(several, 8 * words * calls)
+    run = timed(together(calls, f, big), 8 * words * calls)
     with undisturbed():
         return 1e9 / min(run()[0] for _ in range(rounds))
+
+
+def together(calls: int, f: Callable, *arguments: Any) -> Callable[[], None]:
+    """So many calls of a function of JAX's, waited for together."""
+    import jax
+
+    def run() -> None:
+        for _ in range(calls - 1):
+            f(*arguments)
+        jax.block_until_ready(f(*arguments))
+
+    return run
 
 
 def timed(f: Callable[[], object], evaluations: int) -> Contender:
@@ -160,12 +167,7 @@ def ours(batch: int, note: Callable[[str, float], None], all_forms: bool) -> dic
         jax.block_until_ready(f(*arguments))
         note(name, time.perf_counter() - start)
 
-        def calls() -> None:
-            for _ in range(in_flight - 1):
-                f(*arguments)
-            jax.block_until_ready(f(*arguments))
-
-        contenders[name] = timed(calls, in_flight * evaluations)
+        contenders[name] = timed(together(in_flight, f, *arguments), in_flight * evaluations)
 
     torque = jax.jit(functools.partial(columns.rnea, geometry, bodies))
     plain = jax.jit(jax.vmap(functools.partial(dynamics.rnea, arm.chain), (None, 0, 0, 0)))
@@ -370,13 +372,7 @@ def frax(folder: Path, note: Callable[[str, float], None]) -> dict[str, Contende
     name = f"rnea, frax vmapped over {batch}, float32"
     note(name, time.perf_counter() - start)
     np.testing.assert_allclose(found[0], known, rtol=5e-3, atol=1e-3)  # its products are of TF32
-
-    def calls() -> None:
-        for _ in range(7):
-            torque(*states)
-        jax.block_until_ready(torque(*states))
-
-    return {name: timed(calls, 8 * batch)}
+    return {name: timed(together(8, torque, *states), 8 * batch)}
 
 
 PEERS = {"mujoco_warp": mujoco_warp, "newton": newton, "frax": frax}
