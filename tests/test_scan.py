@@ -9,6 +9,7 @@ import scipy.linalg
 
 from jaxpanda import Arm, Recording, validation
 from jaxpanda import signals as signals_
+from jaxpanda.arms import arm as arm_
 from jaxpanda.diagnosis import search
 from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.premises import pose
@@ -62,7 +63,7 @@ def test_another_arm_with_as_many_joints_compiles_its_dynamics_alone():
         motion_._regressor,
         motion_._gravity_columns,
         motion_._wrench_columns,
-        validation._inverse_dynamics,
+        arm_._inverse_dynamics,
     )
     arm = Arm.panda()
     torques(arm, 1500)
