@@ -215,7 +215,7 @@ def _called(corrected: Corrected, recording: Recording) -> str:
     if recording.path is None:
         return recording.name
     parts = (*recording.path.resolve().parts[:-1], recording.name)
-    names = [e.recording for e in corrected.effects if e.bound_to_recording]  # pyright: ignore
+    names = [name for e in corrected.effects for name in e.recordings]
     return next(
         (name for name in names if parts[-len(Path(name).parts) :] == Path(name).parts), recording.name
     )

@@ -39,6 +39,7 @@ from jaxpanda.effects.unknown import (
     UnknownLimit,
     UnknownOfSpeeds,
     UnknownOfTwo,
+    UnknownShaking,
     UnknownSpin,
 )
 
@@ -89,6 +90,7 @@ def shapes(arm: Arm):
         UnknownOfSpeeds(2, 1, 3, 0.2),
         UnknownDrag(arm.dof, 0.1, (0.1, 0.4)),
         UnknownSpin(arm.dof),
+        UnknownShaking(arm.dof, ("a.csv", "b.csv"), 4.0, "b.csv"),
         UnknownAt(2, 0.1, 0.2),
         UnknownLimit(2, 1.0),
         *(Unknown(2, 2, (-0.4, 0.0, 0.4), form) for form in ("of q", "of q_k", "friction of q")),
@@ -232,6 +234,27 @@ def test_a_drag_and_a_spin_are_what_mujoco_s_jacobians_make_of_them(arm, motion)
         np.testing.assert_allclose(drag[k], slope * linear.T @ linear @ motion.qd[k], atol=1e-9)
         turns = np.cross(angular @ motion.qd[k], R @ momentum)
         np.testing.assert_allclose(spin[k], angular.T @ turns, atol=1e-9)
+
+
+def test_a_base_that_shakes_is_gravity_that_does(arm, motion):
+    shaken = UnknownShaking(arm.dof, ("a.csv", "b.csv"), 4.0)
+    sine, cosine = np.array([0.2, -0.1, 0.4]), np.array([0.0, 0.3, -0.2])
+    tau = shaken.placed("b.csv", None).over(motion) @ np.concatenate([np.zeros(6), sine, cosine])
+    model = to_mujoco(arm.chain, arm.standard)
+    still, data = model.opt.gravity.copy(), mujoco.MjData(model)
+
+    def held(q, gravity):
+        model.opt.gravity[:] = gravity
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        return data.qfrc_bias.copy()
+
+    for k in range(0, motion.samples, max(1, motion.samples // 20)):
+        angle = 2 * np.pi * 4.0 * motion.time[k]
+        base = sine * np.sin(angle) + cosine * np.cos(angle)
+        q = motion.q[k]
+        np.testing.assert_allclose(tau[k], held(q, still - base) - held(q, still), atol=1e-9)
+    assert shaken.placed("c.csv", True) is None
 
 
 def test_a_contact_acts_in_its_interval_only(motion):

@@ -35,6 +35,7 @@ from jaxpanda.effects.unknown import (
     UnknownLimit,
     UnknownOfSpeeds,
     UnknownOfTwo,
+    UnknownShaking,
     UnknownSpin,
 )
 from jaxpanda.recordings import Recording, save
@@ -72,6 +73,7 @@ def every_kind(arm: Arm) -> Corrected:
         (UnknownOfSpeeds(0, 1, 0, 0.5), [0.2]),
         (UnknownDrag(arm.dof, 0.1, (0.1, 0.5)), [0.2, 1.0]),
         (UnknownSpin(arm.dof), [0.02, -0.01, 0.03]),
+        (UnknownShaking(arm.dof, ("b.csv", "a.csv"), 3.0), [0.0] * 6 + [0.1, 0.3, -0.2, 0.2, 0.0, 0.1]),
         (UnknownAt(0, 0.2, 0.1), [0.1, -0.2, 0.2]),
         (PayloadChange(1, 1.0, EVER, "a.csv", "gained"), body),
         (ExternalContact(1, 0.7, 1.2, "a.csv", "point base", (0.1, 0.0, 0.0)), [3.0, 0.0, 5.0]),

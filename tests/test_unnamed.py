@@ -4,17 +4,21 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
-from helpers import excitation, half_correlated, record
+from helpers import excitation, half_correlated, record, to_mujoco
 from jaxpanda_kernels import rnea
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose
+from jaxpanda.diagnosis.calibration import calibrated
+from jaxpanda.diagnosis.diagnosis import fit
+from jaxpanda.diagnosis.events import shaking
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.state import start
 from jaxpanda.diagnosis.traces import prepare as prepare_trace
-from jaxpanda.diagnosis.unnamed import held_off, hum, stuck
+from jaxpanda.diagnosis.unnamed import held_off, hum, standing_off, stuck
 from jaxpanda.signals import prepare
 
 ARM = Arm.panda()
@@ -97,6 +101,20 @@ def test_a_joint_that_holds_still_is_off_by_no_more_than_friction_carries(off, h
     assert found.confidence > 0.9
 
 
+def test_a_joint_that_stands_off_its_noise_foretells_nothing_and_is_doubted():
+    """Models of healthy arms are two to seven times their noise off, which had been told at 0.7."""
+    rubs = lambda t, q, qd: 0.2 * np.sign(qd) * (np.arange(7) == 3)
+    problem = pose((prepare_trace(recording(added=rubs), ARM),), (True,), "exact").problem
+    nothing = start(problem)
+    (found,) = standing_off(problem, nothing, ())
+    assert (found.effect, found.joints, found.foretold) == ("unknown", (3,), 0.0)
+    assert 2 < found.rms_torque[3] / NOISE < 7
+    (told,) = calibrated([found], "unexplained", fit(problem, nothing))
+    assert told.confidence < 0.4
+    (law,) = calibrated([dataclasses.replace(found, foretold=300.0)], "unexplained", fit(problem, nothing))
+    assert law.confidence > 0.5
+
+
 def test_what_a_healthy_arm_hummed_before_is_not_missing():
     hums, healthy = at_joints(0.1, 50.0, 1), recording(1, at_joints(0.1, 50.0, 1), "healthy.csv")
     assert heard(recording(0, hums), healthy, active=(True, False)) is None
@@ -117,6 +135,54 @@ def test_a_diagnosis_says_that_it_hums_beside_what_it_finds(tmp_path):
     ]
     assert found.verdict == "partly_explained"
     assert "50.0" in found.findings[1].summary
+
+
+def shaken(frequency: float, size: float, seed: int = 0) -> Recording:
+    """A motion on a base that shakes along a slanting line, by MuJoCo."""
+    one = recording(seed)
+    model = to_mujoco(ARM.chain, ARM.standard)
+    data, still = mujoco.MjData(model), model.opt.gravity.copy()
+    q, qd, qdd = excitation(ARM, one.time, 3)
+    tau = np.zeros_like(q)
+    for k, t in enumerate(one.time):
+        base = size * np.sin(2 * np.pi * frequency * t + 0.5) * np.array([0.6, -0.5, 0.62])
+        model.opt.gravity[:] = still - base
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[k], qd[k], qdd[k]
+        mujoco.mj_inverse(model, data)
+        tau[k] = data.qfrc_inverse
+    return dataclasses.replace(one, tau=one.tau + tau - np.asarray(LOAD(q, qd, qdd)))
+
+
+def test_a_base_that_shakes_is_found_at_its_frequency_and_no_other_is():
+    def proposed(one: Recording):
+        problem = pose((prepare_trace(one, ARM),), (True,), "exact").problem
+        state = start(problem)
+        return shaking(problem, state.design, state.noise)[0]
+
+    assert proposed(recording()).evidence < 0
+    found = proposed(shaken(5.3, 0.2))
+    assert found.evidence > 100
+    assert float(found.effect.frequency) == pytest.approx(5.3, abs=0.5 / SECONDS)
+
+
+@pytest.mark.slow
+def test_a_diagnosis_says_that_the_base_shakes(tmp_path):
+    from jaxpanda.arms.export import panda_mjcf
+
+    (tmp_path / "arm.xml").write_text(panda_mjcf(), "utf-8")
+    found = diagnose(
+        tmp_path / "arm.xml", [shaken(5.3, 0.2), dataclasses.replace(shaken(5.3, 0.1, 1), name="b")]
+    )
+    assert [(one.effect, one.joints) for one in found.findings] == [("unknown", tuple(range(7)))]
+    assert found.findings[0].recordings == ("motion.csv", "b")
+    assert found.findings[0].intervals is None
+    told = {p["name"]: p for p in found.findings[0].parameters}
+    assert abs(told["frequency"]["value"] - 5.3) < 4 * told["frequency"]["std"]
+    size = lambda k: np.linalg.norm(
+        [told[f"{w}_{x}_{k}"]["value"] for w in ("sine", "cosine") for x in "xyz"]
+    )
+    assert [size(1), size(2)] == pytest.approx([0.2, 0.1], rel=0.1)
+    assert np.all(found.fit.held_out_rmse_after < 1.2 * found.fit.noise_floor)
 
 
 def test_a_torque_that_repeats_itself_while_the_arm_moves_is_told_with_its_times():

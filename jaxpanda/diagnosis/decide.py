@@ -180,7 +180,7 @@ def together(problem: Problem, terms: Sequence[Term]) -> list[list[int]]:
 def _same(problem: Problem, a: Term, b: Term) -> bool:
     if not a.effect.bound_to_recording:
         return True
-    if getattr(a.effect, "recording", "") != getattr(b.effect, "recording", ""):
+    if a.effect.recordings != b.effect.recordings:
         return False
     return a.effect.joints == b.effect.joints or len(_intervals(problem, [a, b])) == 1
 
@@ -215,8 +215,8 @@ def _finding(
     intervals = None
     acting = [np.ones(len(x), bool) for x in together]
     if effect.bound_to_recording:
-        names = [getattr(effect, "recording", names[0])]
-        intervals = _intervals(problem, terms)
+        names = list(effect.recordings)
+        intervals = None if effect.throughout else _intervals(problem, terms)
         acting = [np.any(x != 0, axis=1) for x in together]
     felt = np.concatenate(
         [x[on] for x, on, active in zip(together, acting, problem.active, strict=True) if active]
@@ -283,7 +283,7 @@ def foretold(problem: Problem, laws: State, groups: Sequence[Sequence[int]]) -> 
 
 def _intervals(problem: Problem, terms: Sequence[Term]) -> tuple[tuple[float, float], ...]:
     """When the terms act [s], what touches joined."""
-    trace = next(t for t in problem.traces if t.name == getattr(terms[0].effect, "recording", t.name))
+    trace = next(t for t in problem.traces if t.name in terms[0].effect.recordings)
     first, last = float(trace.channels.t[0]), float(trace.channels.t[-1])
     spans = sorted((max(first, float(t.effect.start)), min(last, float(t.effect.stop))) for t in terms)  # pyright: ignore
     return joined(spans, _TOUCHING)

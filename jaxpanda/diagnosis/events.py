@@ -4,13 +4,14 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
+import scipy.fft
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
 from ..effects.contact import ExternalContact
 from ..effects.drive import TorqueRipple
 from ..effects.load import EVER, PayloadChange
-from ..effects.unknown import SIGN_WIDTH, UnknownAt
+from ..effects.unknown import SIGN_WIDTH, UnknownAt, UnknownShaking
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, levelled, log_bayes, log_mean_exp
 from .host import parallel
 from .problem import Problem
@@ -25,6 +26,8 @@ _SOME = 1e-3
 """Share of a window's power that nothing in the model explains, where it is told at all."""
 _SLOWEST = 5.0
 """Least order of a ripple [1/rad]."""
+_SLOWEST_SHAKING, _FINER = 2.0, 4
+"""Least frequency of a base that shakes [Hz]; how much closer those lie that are tried than a recording's own."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +85,63 @@ def ripple(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]
         )
 
     return [p for p in parallel(one, joints) if p is not None]
+
+
+def shaking(problem: Problem, design: Design, noise: Noise) -> list[Proposal]:
+    """The likeliest frequency at which the base shakes, in all recordings and in each; none where the catalogue
+    has no force from outside, as of drives alone.
+
+    By one transform a recording: what of such torque the model could take is left out of account.
+    """
+    if ExternalContact not in problem.catalogue:
+        return []
+    found = {r: _shaking(problem, design, noise, r) for r, on in enumerate(problem.active) if on}
+    finest = max((frequency for frequency, *_ in found.values()), key=len)
+    each = {r: np.interp(finest, frequency, score) for r, (frequency, score, _) in found.items()}
+    out = []
+    for some in dict.fromkeys([tuple(found), *((r,) for r in found)]):
+        score, names = sum(each[r] for r in some), tuple(problem.traces[r].name for r in some)
+        top = int(np.argmax(score))
+        effect = UnknownShaking(problem.dof, names, float(finest[top]))
+        scale = [np.repeat(np.interp(finest[top], found[r][0], found[r][2]), 6) for r in some]
+        deviation = np.concatenate(scale) * [k.scale for k in effect.coefficients]
+        best, prior = float(score[top]), effect.form_prior
+        steps = (0.4 * float(finest[1] / finest[top] - finest[0] / finest[top]),)
+        out.append(Proposal(effect, float(log_mean_exp(score)) + prior, best + prior, deviation, steps))
+    return out
+
+
+def _shaking(
+    problem: Problem, design: Design, noise: Noise, r: int
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Frequencies of a base that shakes in a recording, the evidence of each, and its likeliest scale."""
+    trace, rows = problem.traces[r], problem.rows[r]
+    dt, size = trace.motion.dt, scipy.fft.next_fast_len(_FINER * trace.motion.samples)
+    frequency = np.fft.rfftfreq(size, dt)
+    tried = np.flatnonzero((frequency > _SLOWEST_SHAKING) & (frequency < 0.9 * trace.cutoff))
+    frequency = frequency[tried]
+    begin = np.exp(2j * np.pi * frequency * trace.motion.time[0])
+    b, G = np.zeros((len(tried), 6)), np.zeros((len(tried), 6, 6))
+    for joint, columns in enumerate(np.swapaxes(trace.motion.gravity_columns, 0, 1)):
+        weights = problem.weights(noise, r, joint)
+        back = noise.transposed(design.left[joint][rows], joint, weights, rows)
+        spectrum = np.fft.rfft(back[:, None] * columns, size, axis=0)[tried].conj() * begin[:, None]
+        b -= np.concatenate([spectrum.imag, spectrum.real], 1)
+        passed = _response(noise, joint, 2 * np.pi * frequency * dt) / 2
+        felt = weights[:, None] * columns
+        G += passed[:, None, None] * np.kron(np.eye(2), felt.T @ felt)
+    size = [k.scale for k in UnknownShaking(problem.dof, (trace.name,), 1.0).coefficients]
+    return frequency, *log_bayes(b, G, np.tile(size, (len(b), 1)), PHYSICAL_SCALES)
+
+
+def _response(noise: Noise, joint: int, angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Power that whitening makes of a wave of unit power, at so many radians a step."""
+    back = np.exp(-1j * angle)
+    out = 1 - sum(a * back ** (k + 1) for k, a in enumerate(noise.a[joint]))
+    if noise.has_slow(joint):
+        pole, zero = noise.slow[joint]  # pyright: ignore
+        out = out * (1 - pole * back) / (1 - zero * back)
+    return np.abs(out / noise.sigma[joint]) ** 2
 
 
 def spots(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]) -> list[Proposal]:

@@ -87,8 +87,8 @@ class Grid:
         if not self.active[r]:
             return []
         names = [t.name for t in self.traces]
-        bound = getattr(effects[0], "recording", None)
-        later = None if bound is None else r > names.index(bound)
+        bound = effects[0].recordings
+        later = r > names.index(bound[0]) if bound else None
         return [p for e in effects if (p := e.placed(names[r], later)) is not None]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..effects import AbstractEffect, AbstractJointEffect
 from .alike import one_more
 from .credible import is_credible
-from .events import Proposal, ripple, spots, windows
+from .events import Proposal, ripple, shaking, spots, windows
 from .evidence import Design, Noise, log_mean_exp
 from .host import parallel
 from .library import Candidates
@@ -55,7 +55,8 @@ def ranked(
     if events and likeliest > _AHEAD * max(0.0, *(p.evidence for p in events)):
         kept += events
     elif len(where) > 1 or joints is None or before:
-        scanned += [_weighed(problem, design, noise, p) for p in windows(problem, design, noise)]
+        found = (*windows(problem, design, noise), *shaking(problem, design, noise))
+        scanned += [_weighed(problem, design, noise, p) for p in found]
     many = problem.places
     held = Counter(t.effect.name for t in design.terms)
     best: dict[tuple, Proposal] = {}

@@ -134,7 +134,7 @@ def climbed(
     if not steps:
         return effect, best, deviation
     scale, rounds = np.array(steps), _ROUNDS if len(steps) == 1 else _ROUNDS + 1
-    place = form_of(effect), effect.joints, getattr(effect, "recording", None)
+    place = form_of(effect), effect.joints, effect.recordings
     if (before := problem.likeliest_shapes.get(place)) is not None:
         known, deviation_there = evidence_of(problem, design, noise, before)
         if known > best:

@@ -116,6 +116,7 @@ def _standing_off(
         parameters=(),
         rms_torque=rms,
         evidence=float(0.5 * samples * (beyond - 1 - np.log(beyond))),
+        foretold=0.0,
         summary=f"Joint {joint + 1} is {np.sqrt(beyond):.1f} times its noise off the simulation{at}; neither a"
         " named effect nor a free curve explains it.",
         terms=(),

@@ -110,6 +110,8 @@ class AbstractEffect(eqx.Module):
     """Whether it changes with the clock; nobody knows how it goes on after what was recorded (`beyond`)."""
     bound_to_recording: ClassVar[bool] = False
     """Whether it happened at some time in a recording; `placed` says what that means for others."""
+    throughout: ClassVar[bool] = False
+    """Whether it then lasts as long as the recording, of which parts tell what it is in others."""
     longest: ClassVar[float] = 1.0
     """Share of its recording that an event takes at most: what is always there says nothing of when."""
     dissipates: ClassVar[bool] = False
@@ -141,6 +143,11 @@ class AbstractEffect(eqx.Module):
     @abc.abstractmethod
     def equation(self) -> str:
         """Readable equation in the symbols of the parameters."""
+
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """Names of those it is bound to."""
+        return (self.recording,) if self.bound_to_recording else ()  # pyright: ignore
 
     @property
     def passes(self) -> bool:

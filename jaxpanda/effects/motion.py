@@ -182,13 +182,19 @@ def _regressor(arm, q, qd, qdd):
     return Y.reshape(*Y.shape[:2], -1)
 
 
-@jax.jit
-def _gravity_columns(arm, q):
-    def torque(g, q):
+def gravity_columns(arm: Arm, q: Float[Array, " dof"]) -> Float[Array, "dof 3"]:
+    """`Motion.gravity_columns` of one pose."""
+
+    def torque(g):
         chain = eqx.tree_at(lambda c: c.gravity, arm.chain, g)
         return rnea(chain, arm.standard, q, jnp.zeros_like(q), jnp.zeros_like(q))
 
-    return jax.vmap(jax.jacfwd(torque), (None, 0))(arm.chain.gravity, q)
+    return jax.jacfwd(torque)(arm.chain.gravity)
+
+
+@jax.jit
+def _gravity_columns(arm, q):
+    return jax.vmap(lambda q: gravity_columns(arm, q))(q)
 
 
 @jax.jit

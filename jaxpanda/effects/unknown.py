@@ -1,5 +1,6 @@
 """What no named effect explains: a free function of a channel or two, so that it is still located and fitted."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
@@ -20,7 +21,8 @@ from .effect import (
     sign_over_velocity,
     smooth_sign,
 )
-from .motion import Channels, Joint, Motion, wrench_columns
+from .load import EVER
+from .motion import Channels, Joint, Motion, gravity_columns, wrench_columns
 
 FREE = -21.0
 """Prior of a torque that has no law."""
@@ -349,6 +351,85 @@ class UnknownSpin(AbstractArmEffect):
         return [{**p, "joint": None} for p in super().parameters(c, covariance)]
 
 
+class UnknownShaking(AbstractArmEffect):
+    r"""A base that shakes at one frequency throughout recordings, as on a cart, or beside another machine.
+
+    $$\tau = -\frac{\partial\tau}{\partial g}(q)\,(a \sin 2\pi f t + b \cos 2\pi f t)$$
+
+    with the base's acceleration $a \sin 2\pi f t + b \cos 2\pi f t$ along its axes, of each recording another.
+    """
+
+    name: ClassVar[str] = "unknown"
+    prior: ClassVar[float] = FREE
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("frequency", "Hz", 0.1, 1e3),)
+    reveals: ClassVar[str] = "a recording with the base at rest"
+    bound_to_recording: ClassVar[bool] = True
+    throughout: ClassVar[bool] = True
+    repeats: ClassVar[bool] = True
+
+    dof: int = eqx.field(static=True)
+    shaken: tuple[str, ...] = eqx.field(static=True)
+    """Names of the recordings."""
+    frequency: Float[Array, ""] | float
+    now: str = eqx.field(static=True, default="")
+    """Which of them `placed` was asked for."""
+    start: float = eqx.field(static=True, default=-EVER)
+    stop: float = eqx.field(static=True, default=EVER)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["UnknownShaking"]:
+        return []  # the event scan proposes them
+
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        return self.shaken
+
+    def placed(self, recording: str, later: bool | None) -> "UnknownShaking | None":
+        return dataclasses.replace(self, now=recording) if recording in self.shaken else None
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return tuple(range(self.dof))
+
+    @property
+    def form_prior(self) -> float:
+        return LAWFUL
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        ends = [f"_{k + 1}" for k in range(len(self.shaken))] if len(self.shaken) > 1 else [""]
+        names = [f"{wave}_{axis}{end}" for end in ends for wave in ("sine", "cosine") for axis in "xyz"]
+        return tuple(Coefficient(name, "m/s²", scale=0.3) for name in names)
+
+    @property
+    def equation(self) -> str:
+        a = "(sine * sin(2 pi frequency t) + cosine * cos(2 pi frequency t))"
+        return f"tau = -dtau/dg(q) * {a}: a base that shakes"
+
+    @property
+    def _own(self) -> slice:
+        """Coefficients of the recording that is asked for."""
+        k = self.shaken.index(self.now)
+        return slice(6 * k, 6 * k + 6)
+
+    def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        out = np.zeros((motion.samples, self.dof, len(self.coefficients)))
+        if self.now:
+            angle = 2 * np.pi * float(self.frequency) * motion.time
+            G = motion.gravity_columns
+            waves = (wave(angle)[:, None, None] for wave in (np.sin, np.cos))
+            out[..., self._own] = np.concatenate([-G * wave for wave in waves], 2)
+        return out
+
+    def resist(self, c, arm, z, s, dt):
+        angle, own = 2 * jnp.pi * self.frequency * s.t, c[self._own]
+        acceleration = jnp.sin(angle) * own[:3] + jnp.cos(angle) * own[3:]
+        return Resistance(-gravity_columns(arm, jnp.asarray(s.q)) @ acceleration, jnp.zeros_like(s.q), z)
+
+    def parameters(self, c, covariance):
+        return [{**p, "joint": None} for p in super().parameters(c, covariance)]
+
+
 def _from_rest(interp: Any, x: Any, knots: Sequence[float]) -> list[Any]:
     """Share of each knot in a piecewise linear function of x that is zero at zero; `interp`: numpy's or JAX's."""
     ends = np.array([0.0, *knots])
@@ -452,4 +533,13 @@ class UnknownLimit(AbstractInstantEffect):
         return tau - jnp.clip(tau, -self.limit, self.limit)
 
 
-EFFECTS = (Unknown, UnknownOfTwo, UnknownOfSpeeds, UnknownDrag, UnknownSpin, UnknownAt, UnknownLimit)
+EFFECTS = (
+    Unknown,
+    UnknownOfTwo,
+    UnknownOfSpeeds,
+    UnknownDrag,
+    UnknownSpin,
+    UnknownShaking,
+    UnknownAt,
+    UnknownLimit,
+)
