@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
-import scipy.fft
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
@@ -26,8 +25,9 @@ _SOME = 1e-3
 """Share of a window's power that nothing in the model explains, where it is told at all."""
 _SLOWEST = 5.0
 """Least order of a ripple [1/rad]."""
-_SLOWEST_SHAKING, _FINER = 2.0, 4
-"""Least frequency of a base that shakes [Hz]; how much closer those lie that are tried than a recording's own."""
+_SLOWEST_SHAKING, _FINER, _LONG = 2.0, 3, 8.0
+"""Least frequency of a base that shakes [Hz]; how much closer those lie that are tried than a recording's own, at
+least; and how long it must be for one to be told from those beside it [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,20 +91,26 @@ def shaking(problem: Problem, design: Design, noise: Noise) -> list[Proposal]:
     """The likeliest frequency at which the base shakes, in all recordings and in each; none where the catalogue
     has no force from outside, as of drives alone.
 
-    By one transform a recording: what of such torque the model could take is left out of account.
+    By one transform a recording: what of such torque the model could take is left out of account. In short ones a
+    frequency is as wide as what an arm does by itself, swinging on its gears.
     """
     if ExternalContact not in problem.catalogue:
         return []
-    found = {r: _shaking(problem, design, noise, r) for r, on in enumerate(problem.active) if on}
+    acting = zip(problem.traces, problem.active, strict=True)
+    long = [r for r, (t, on) in enumerate(acting) if on and np.ptp(t.motion.time) > _LONG]
+    if not long:
+        return []
+    found = {r: _shaking(problem, design, noise, r) for r in long}
     finest = max((frequency for frequency, *_ in found.values()), key=len)
     each = {r: np.interp(finest, frequency, score) for r, (frequency, score, _) in found.items()}
     out = []
     for some in dict.fromkeys([tuple(found), *((r,) for r in found)]):
-        score, names = sum(each[r] for r in some), tuple(problem.traces[r].name for r in some)
+        score = np.sum([each[r] for r in some], 0)
+        names = tuple(problem.traces[r].name for r in some)
         top = int(np.argmax(score))
         effect = UnknownShaking(problem.dof, names, float(finest[top]))
         scale = [np.repeat(np.interp(finest[top], found[r][0], found[r][2]), 6) for r in some]
-        deviation = np.concatenate(scale) * [k.scale for k in effect.coefficients]
+        deviation = np.concatenate(scale) * np.array([k.scale for k in effect.coefficients])
         best, prior = float(score[top]), effect.form_prior
         steps = (0.4 * float(finest[1] / finest[top] - finest[0] / finest[top]),)
         out.append(Proposal(effect, float(log_mean_exp(score)) + prior, best + prior, deviation, steps))
@@ -116,7 +122,8 @@ def _shaking(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Frequencies of a base that shakes in a recording, the evidence of each, and its likeliest scale."""
     trace, rows = problem.traces[r], problem.rows[r]
-    dt, size = trace.motion.dt, scipy.fft.next_fast_len(_FINER * trace.motion.samples)
+    dt = trace.motion.dt
+    size = 1 << (_FINER * trace.motion.samples - 1).bit_length()
     frequency = np.fft.rfftfreq(size, dt)
     tried = np.flatnonzero((frequency > _SLOWEST_SHAKING) & (frequency < 0.9 * trace.cutoff))
     frequency = frequency[tried]
@@ -130,8 +137,8 @@ def _shaking(
         passed = _response(noise, joint, 2 * np.pi * frequency * dt) / 2
         felt = weights[:, None] * columns
         G += passed[:, None, None] * np.kron(np.eye(2), felt.T @ felt)
-    size = [k.scale for k in UnknownShaking(problem.dof, (trace.name,), 1.0).coefficients]
-    return frequency, *log_bayes(b, G, np.tile(size, (len(b), 1)), PHYSICAL_SCALES)
+    expected = np.array([k.scale for k in UnknownShaking(problem.dof, (trace.name,), 1.0).coefficients])
+    return frequency, *log_bayes(b, G, np.tile(expected, (len(b), 1)), PHYSICAL_SCALES)
 
 
 def _response(noise: Noise, joint: int, angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
