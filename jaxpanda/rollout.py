@@ -291,7 +291,7 @@ def make_task(recording: Recording, timestep: float, plant: Plant, seconds: floa
 
 def _begin(plant: Plant, seconds: float) -> float:
     """Start of a window in which what happened in the recording happens [s]."""
-    edges = [float(v) for e, _ in plant.laws if e.bound_to_recording for v in (e.start, e.stop)]  # pyright: ignore
+    edges = [float(v) for e, _ in plant.laws if e.is_event for v in (e.start, e.stop)]  # pyright: ignore
     edges = [v for v in edges if np.isfinite(v) and abs(v) < 1e8]
     return 0.5 * (min(edges) + max(edges)) - 0.5 * seconds if edges else -np.inf
 

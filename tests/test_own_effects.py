@@ -122,6 +122,12 @@ def test_an_effect_that_is_unfinished_or_whose_name_is_taken_is_refused(name, ba
         diagnose(model, [record(20)], effects=[type("Other", (base,), {"name": name})])
 
 
+def test_an_effect_of_a_recording_must_name_it(model):
+    unnamed = type("Other", (CoupledDamping,), {"name": "slip", "bound_to_recording": True})
+    with pytest.raises(InputError, match="Other is bound to a recording, and lacks its name"):
+        diagnose(model, [record(20)], effects=[unnamed])
+
+
 def test_a_diagnosis_travels_by_pickle(found):
     again = pickle.loads(pickle.dumps(found))
     assert [f.to_json() for f in again.findings] == [f.to_json() for f in found.findings]

@@ -89,8 +89,7 @@ def is_of_time(problem: Problem, design: Design, noise: Noise, proposal: Proposa
     What comes again with the motion, and is no steady law of the drift's kind, is some function of the motion.
     """
     effect = proposal.effect
-    of_time = effect.drifts or (effect.bound_to_recording and not effect.throughout)
-    if not of_time or proposal.evidence < 0:
+    if not (effect.drifts or effect.is_event) or proposal.evidence < 0:
         return True
     shifts = [round(t.signals.period / t.motion.dt) if t.signals.period else 0 for t in problem.traces]
     if not any(shifts):

@@ -216,7 +216,7 @@ def _finding(
     acting = [np.ones(len(x), bool) for x in together]
     if effect.bound_to_recording:
         names = list(effect.recordings)
-        intervals = None if effect.throughout else _intervals(problem, terms)
+        intervals = _intervals(problem, terms) if effect.is_event else None
         acting = [np.any(x != 0, axis=1) for x in together]
     felt = np.concatenate(
         [x[on] for x, on, active in zip(together, acting, problem.active, strict=True) if active]

@@ -402,7 +402,7 @@ def held_out(problem: Problem, state: State) -> list[tuple[np.ndarray, np.ndarra
 
     What happened once in a recording has no second instance to be tested on: those samples are left out.
     """
-    bound = [t for t in state.terms if t.effect.bound_to_recording and not t.effect.throughout]
+    bound = [t for t in state.terms if t.effect.is_event]
     folds = signals_.blocks_many([t.signals for t in problem.traces], FOLDS)
     out = []
     for r, trace in enumerate(problem.traces):

@@ -134,21 +134,11 @@ def _shaking(
         back = noise.transposed(design.left[joint][rows], joint, weights, rows)
         spectrum = np.fft.rfft(back[:, None] * columns, size, axis=0)[tried].conj() * begin[:, None]
         b -= np.concatenate([spectrum.imag, spectrum.real], 1)
-        passed = _response(noise, joint, 2 * np.pi * frequency * dt) / 2
+        passed = 0.5 * noise.response(joint, 2 * np.pi * frequency * dt)
         felt = weights[:, None] * columns
         G += passed[:, None, None] * np.kron(np.eye(2), felt.T @ felt)
     expected = np.array([k.scale for k in UnknownShaking(problem.dof, (trace.name,), 1.0).coefficients])
     return frequency, *log_bayes(b, G, np.tile(expected, (len(b), 1)), PHYSICAL_SCALES)
-
-
-def _response(noise: Noise, joint: int, angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Power that whitening makes of a wave of unit power, at so many radians a step."""
-    back = np.exp(-1j * angle)
-    out = 1 - sum(a * back ** (k + 1) for k, a in enumerate(noise.a[joint]))
-    if noise.has_slow(joint):
-        pole, zero = noise.slow[joint]  # pyright: ignore
-        out = out * (1 - pole * back) / (1 - zero * back)
-    return np.abs(out / noise.sigma[joint]) ** 2
 
 
 def spots(problem: Problem, design: Design, noise: Noise, joints: Iterable[int]) -> list[Proposal]:

@@ -171,6 +171,15 @@ class Noise:
         """Whether there is an error slower than the noise in a joint."""
         return self.slow is not None and bool(self.slow[joint, 0] != self.slow[joint, 1])
 
+    def response(self, joint: int, angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """What `whiten` makes of the power of a wave that turns by so many radians a step."""
+        back = np.exp(-1j * angle)
+        out = 1 - sum(a * back ** (k + 1) for k, a in enumerate(self.a[joint]))
+        if self.has_slow(joint):
+            pole, zero = self.slow[joint]  # pyright: ignore
+            out = out * (1 - pole * back) / (1 - zero * back)
+        return np.abs(out / self.sigma[joint]) ** 2
+
     def innovations(self, x: Float[np.ndarray, "_time ..."], joint: int) -> Float[np.ndarray, "_time ..."]:
         """x less what the noise's past foretells of it; the first rows are zero."""
         a = self.a[joint]

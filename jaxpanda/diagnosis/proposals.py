@@ -78,7 +78,7 @@ def ranked(
 
 
 def _weighed(problem: Problem, design: Design, noise: Noise, proposal: Proposal) -> Proposal:
-    """A window with its own evidence: that of the scan is what its columns would have without slow errors."""
+    """A proposal with its own evidence: scans leave out slow errors, or what the model could take."""
     best, deviation = evidence_of(problem, design, noise, proposal.effect)
     gained = best - proposal.best
     return dataclasses.replace(proposal, best=best, deviation=deviation, evidence=proposal.evidence + gained)

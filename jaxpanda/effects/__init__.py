@@ -1,5 +1,6 @@
 """The catalogue of physics beyond rigid bodies: one class an effect, one file a family."""
 
+import dataclasses
 import inspect
 from collections.abc import Sequence
 
@@ -52,6 +53,11 @@ def catalogue_with(effects: Sequence[type[AbstractEffect]]) -> tuple[type[Abstra
         if not isinstance(getattr(effect, "name", None), str):
             raise InputError(
                 f"effects: {effect.__name__} lacks a name, such as name: ClassVar[str] = 'gear_slip'"
+            )
+        names_it = "recording" in {field.name for field in dataclasses.fields(effect)}
+        if effect.bound_to_recording and effect.recordings is AbstractEffect.recordings and not names_it:
+            raise InputError(
+                f"effects: {effect.__name__} is bound to a recording, and lacks its name, a field recording: str"
             )
         taken = next((c for c in out if effect.name == c.name or effect.__name__ == c.__name__), None)
         if taken is not None:

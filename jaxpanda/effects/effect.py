@@ -109,9 +109,9 @@ class AbstractEffect(eqx.Module):
     drifts: ClassVar[bool] = False
     """Whether it changes with the clock; nobody knows how it goes on after what was recorded (`beyond`)."""
     bound_to_recording: ClassVar[bool] = False
-    """Whether it happened at some time in a recording; `placed` says what that means for others."""
+    """Whether it belongs to a recording; `placed` says what that means for others."""
     throughout: ClassVar[bool] = False
-    """Whether it then lasts as long as the recording, of which parts tell what it is in others."""
+    """Whether it then lasts as long as that does: one part of it tells what is to be seen in another."""
     longest: ClassVar[float] = 1.0
     """Share of its recording that an event takes at most: what is always there says nothing of when."""
     dissipates: ClassVar[bool] = False
@@ -143,6 +143,11 @@ class AbstractEffect(eqx.Module):
     @abc.abstractmethod
     def equation(self) -> str:
         """Readable equation in the symbols of the parameters."""
+
+    @property
+    def is_event(self) -> bool:
+        """Whether it happened at some time in a recording, from `start` to `stop`."""
+        return self.bound_to_recording and not self.throughout
 
     @property
     def recordings(self) -> tuple[str, ...]:

@@ -21,7 +21,6 @@ from .effect import (
     sign_over_velocity,
     smooth_sign,
 )
-from .load import EVER
 from .motion import Channels, Joint, Motion, gravity_columns, wrench_columns
 
 FREE = -21.0
@@ -373,8 +372,6 @@ class UnknownShaking(AbstractArmEffect):
     frequency: Float[Array, ""] | float
     now: str = eqx.field(static=True, default="")
     """Which of them `placed` was asked for."""
-    start: float = eqx.field(static=True, default=-EVER)
-    stop: float = eqx.field(static=True, default=EVER)
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownShaking"]:
