@@ -1,6 +1,7 @@
 """An arm that holds still: what is beyond friction at rest is told, what is within it is not."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +16,7 @@ from jaxpanda.arms.source import from_mjcf
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.resting import AtRest, judge
 from jaxpanda.diagnosis.traces import prepare
-from jaxpanda.effects import Motion
+from jaxpanda.effects import AbstractInstantEffect, Channels, Coefficient, LawAtRest, Levels, Motion
 from jaxpanda.errors import InputError
 from jaxpanda.recordings import save
 
@@ -139,6 +140,47 @@ def test_what_healthy_recordings_of_the_same_pose_show_is_not_told(rubbing):
     assert judged(rubbing, rest(20, biased)).findings
     healthy = rest(21, biased, pose=20)
     assert not judged(rubbing, rest(20, biased), reference=[healthy]).findings
+
+
+class BeltTension(AbstractInstantEffect):
+    """A belt that pulls at joints 3 and 5 alike, whatever the pose."""
+
+    name: ClassVar[str] = "belt_tension"
+    family: ClassVar[str] = "drive"
+    at_rest: ClassVar[str] = "a belt that is too tight"
+    joint: int = 4
+
+    @classmethod
+    def grid(cls, arm: Arm):
+        return [cls()]
+
+    @classmethod
+    def while_still(cls, levels: Levels):
+        pull = np.tile(5.0 * (np.eye(7)[2] + np.eye(7)[4]), len(levels.poses))[:, None]
+        return [LawAtRest(pull, 0.06, 4, (("tension", "N·m", 5.0),))]
+
+    @property
+    def coefficients(self):
+        return (Coefficient("tension", "N·m"),)
+
+    @property
+    def equation(self) -> str:
+        return "tau = tension"
+
+    def at(self, s: Channels):
+        return jnp.ones(1)
+
+
+def test_an_effect_of_the_users_own_speaks_of_an_arm_that_holds_still(rubbing):
+    tight = lambda t, at: 6.0 * (np.eye(7)[2] + np.eye(7)[4]) * np.ones((len(t), 1))
+    recordings = [rest(k, tight, pose=k) for k in (30, 31, 32, 33)]
+    (known,) = judged(rubbing, *recordings).findings
+    assert known.effect == "unknown"
+    (one,) = diagnose(rubbing, recordings, effects=[BeltTension]).findings
+    assert (one.effect, one.family, one.joints) == ("belt_tension", "drive", (4,))
+    assert "a belt that is too tight" in one.summary
+    (pull,) = one.parameters
+    assert abs(pull["value"] - 6.0) < 3 * pull["std"]
 
 
 def sets_out(seed: int, seconds: float) -> Recording:

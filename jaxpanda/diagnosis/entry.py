@@ -103,7 +103,7 @@ def diagnosed(
         given = [one for one, on in zip(loaded, active, strict=True) if on]
         suspect = [_at_rest(one, trace, coarse) for one, trace in zip(given, suspect, strict=True)]
         healthy = [trace for trace, on in zip(traces, active, strict=True) if not on]
-        return _as_it_is(judge(suspect, healthy, source, knowledge), arm)
+        return _as_it_is(judge(suspect, healthy, source, knowledge, catalogue), arm)
     for recording in loaded:
         _require_live_torque(recording)
     in_question = [one.of_link_side() for one, on in zip(loaded, active, strict=True) if on]

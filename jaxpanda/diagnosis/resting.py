@@ -23,6 +23,7 @@ and what the prediction uses is the user's own model.
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -36,7 +37,7 @@ from ..arms.arm import Arm
 from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
-from ..effects import Motion
+from ..effects import CATALOGUE, AbstractEffect, LawAtRest, Levels, Motion, may_carry
 from ..errors import InputError
 from ..recordings import Recording
 from ..report import Figure, Section, Table, number
@@ -59,51 +60,16 @@ _CHANCE = 0.01
 """Probability that noise makes an event of a recording, before anything is compared."""
 _UNSURE = 3.0
 """How much larger than it seems a deviation of noise may be, times the root of how many means tell it."""
-_WEIGHS = 0.02
-"""Deviation of friction that a model lacks, as a share of the weight beyond a joint at its lever."""
-_LEAST = 0.2
-"""The same where nothing weighs on the joint [N m]."""
 _ABSOLUTE = 0.05
 """How well a level of torque is known beside noise, as a share of that."""
-_FORCE, _MOMENT = 30.0, 5.0
-"""Deviations of a force from outside [N] and its moment [N m]."""
-_MASS, _REACH = 2.0, 0.1
-"""Deviations of a body's mass [kg] and of the place of its centre of mass [m]."""
-_TILT = 0.03
-"""Deviation of a base that is not level [rad]."""
 _SIZES = 1.0, 0.2
 """Half of what happens is of the declared deviations, half smaller by this."""
-_LEANS = 0.2
-"""Share of the forces from outside that point straight down, or up, as a weight does."""
 _VARIES = 2.5
 """How far the variance of noise from block to block may differ by chance, in itself."""
-_STEADY = {
-    "": 0.5,
-    "payload": 0.12,
-    "external_contact": 0.08,
-    "coulomb_friction": 0.1,
-    "inertial_parameters": 0.08,
-    "torque_offset": 0.06,
-    "gravity_direction": 0.04,
-    "unknown": 0.02,
-}
-"""Prior odds of what stands in a level throughout; "" is nothing."""
-_PASSING = {"": 0.5, "external_contact": 0.3, "payload_change": 0.1, "torque_drift": 0.05, "unknown": 0.05}
-_LASTING = {"": 0.5, "external_contact": 0.2, "payload_change": 0.2, "torque_drift": 0.05, "unknown": 0.05}
-"""The same of an event that passes within the recording, and of one that begins or ends with it."""
+_NOTHING = 0.5
+"""Prior odds of nothing, beside those that effects declare."""
 _TOLD = 0.02
 """Probability from which an alternative is told."""
-_FAMILY_SAYS = {
-    "external_contact": "a force from outside",
-    "payload_change": "a body gained or lost at the flange",
-    "payload": "a body at the flange that the model does not have",
-    "torque_drift": "a torque sensor that drifts",
-    "torque_offset": "a bias of the torque sensors",
-    "gravity_direction": "a base that is not level",
-    "inertial_parameters": "links that differ from the model's",
-    "coulomb_friction": "friction that the model does not have, and that carries a load at rest",
-    "unknown": "torque that none of these explains",
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,7 +190,11 @@ def while_still(recording: Recording, trace: Trace) -> Recording:
 
 
 def judge(
-    traces: Sequence[Trace], reference: Sequence[Trace], source: MjcfSource, knowledge: Knowledge
+    traces: Sequence[Trace],
+    reference: Sequence[Trace],
+    source: MjcfSource,
+    knowledge: Knowledge,
+    catalogue: Sequence[type[AbstractEffect]] = CATALOGUE,
 ) -> AtRest:
     """What recordings in all of which the arm holds still say.
 
@@ -233,13 +203,14 @@ def judge(
         reference: of recordings from when nothing was wrong; those at rest in the same pose count.
         source: the simulation.
         knowledge: how well its numbers are known.
+        catalogue: effects that are tried.
     """
     arm = traces[0].motion.arm
     bound = np.asarray(arm.frictionloss)
     levels = tuple(_with_events(_level(trace), bound) for trace in traces)
     healthy = [_level(trace) for trace in reference if rests(trace)]
-    found = [one for level in levels for one in _events(level, arm)]
-    steady = _steady(levels, healthy, arm, knowledge)
+    found = [one for level in levels for one in _events(level, arm, catalogue)]
+    steady = _steady(levels, healthy, arm, knowledge, catalogue)
     found = sorted([*found, *steady], key=lambda one: -one.evidence)
     before = np.concatenate([t.residual_at_rest for t in traces])
     rms = np.sqrt(np.mean(before**2, 0))
@@ -249,7 +220,7 @@ def judge(
         verdict="consistent"
         if not found
         else "unexplained"
-        if {one.effect for one in found} == {"unknown"}
+        if {one.family for one in found} == {"unknown"}
         else "partly_explained",
         findings=tuple(found),
         fit=Fit(rms, rms, rms, rms, np.maximum(floor, 1e-9)),
@@ -355,25 +326,13 @@ def _interval(level: Level, bound: Float[np.ndarray, " dof"]) -> np.ndarray | No
     return quiet[first[best] : last[best]]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Model:
-    """One explanation: which effect, its columns over all levels scaled to unit deviation, and where it acts."""
-
-    effect: str
-    columns: Float[np.ndarray, "rows n"]
-    odds: float
-    link: int | None = None
-    names: tuple[tuple[str, str, float], ...] = ()
-    """Of the parameters: name, unit, deviation."""
-    positive: bool = False
-    """The first parameter is no less than 0."""
-    scale: float = 1.0
-    """Of the columns, in those of the declared deviations."""
+Cause = type[AbstractEffect] | None
+"""What explains levels of torque: an effect, or nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Fitted:
-    """A model's evidence [nats] and parameters."""
+    """A law's evidence [nats] and parameters."""
 
     evidence: float
     x: Float[np.ndarray, " n"]
@@ -381,14 +340,14 @@ class _Fitted:
 
 
 def _fitted(
-    model: _Model,
+    law: LawAtRest,
     d: Float[np.ndarray, " rows"],
     std: Float[np.ndarray, " rows"],
     bound: Float[np.ndarray, " rows"],
     links: Float[np.ndarray, "rows m"],
 ) -> _Fitted:
-    """The equation at the top of this file, by Newton's method; `links` are columns that every model has."""
-    B = np.concatenate([model.columns, links], 1)
+    """The equation at the top of this file, by Newton's method; `links` are columns that every law has."""
+    B = np.concatenate([law.columns, links], 1)
     n = B.shape[1]
     x = np.zeros(n)
 
@@ -411,100 +370,67 @@ def _fitted(
     H = wide.T @ wide + np.eye(n)
     covariance = np.linalg.inv(H)
     evidence = -cost(x) - 0.5 * float(np.linalg.slogdet(H)[1])
-    if model.positive:
+    if law.positive:
         evidence += float(scipy.special.log_ndtr(x[0] / np.sqrt(covariance[0, 0]))) + np.log(2.0)
-    count = model.columns.shape[1]
+    count = law.columns.shape[1]
     return _Fitted(evidence, x[:count], covariance[:count, :count])
 
 
-def _contacts(motion: Motion, odds: float) -> list[_Model]:
-    """A force and a moment on each link, along the base's axes."""
-    scales = np.repeat([_FORCE, _MOMENT], 3)
-    names = tuple(
-        (f"{what}_{axis}", unit, s)
-        for what, unit, s in (("force", "N", _FORCE), ("moment", "N·m", _MOMENT))
-        for axis in "xyz"
-    )
-    return [
-        _Model("external_contact", motion.wrench_columns[0, k] * scales, odds / motion.dof, k, names)
-        for k in range(motion.dof)
-    ]
-
-
-def _body(motions: Sequence[Motion], effect: str, odds: float, positive: bool) -> _Model:
-    """A body on the last link: mass, and first moment about where it is fastened."""
-    k = motions[0].dof - 1
-    columns = np.concatenate([m.regressor[0][:, 10 * k : 10 * k + 4] for m in motions])
-    scales = np.array([_MASS, *[_MASS * _REACH] * 3])
-    names = (("mass", "kg", _MASS), *((f"mass_times_{axis}", "kg·m", _MASS * _REACH) for axis in "xyz"))
-    return _Model(effect, columns * scales, odds, k, names, positive)
-
-
-def may_carry(arm: Arm) -> Float[np.ndarray, " dof"]:
-    """Deviation of friction that a model lacks, by what hangs beyond a joint [N m]."""
-    mass = np.asarray(arm.standard[:, 0])
-    steps = np.linalg.norm(np.asarray(arm.chain.p), axis=1)
-    lever = np.array([0.5 * np.sum(steps[j + 1 :]) + 0.05 for j in range(arm.dof)])
-    beyond = np.cumsum(mass[::-1])[::-1]
-    return _LEAST + _WEIGHS * 9.81 * beyond * lever
-
-
 def _compared(
-    models: Sequence[_Model], d: np.ndarray, std: np.ndarray, bound: np.ndarray, links: np.ndarray
-) -> tuple[dict[str, float], dict[str, tuple[_Model, _Fitted]], float]:
-    """Probability of each effect, the best model of each, and evidence of the best over nothing [nats]."""
-    models = [
-        dataclasses.replace(model, columns=size * model.columns, odds=model.odds / 2, scale=size)
-        for model in models
+    catalogue: Sequence[type[AbstractEffect]],
+    levels: Levels,
+    d: Float[np.ndarray, " rows"],
+    std: Float[np.ndarray, " rows"],
+    bound: Float[np.ndarray, " rows"],
+    links: Float[np.ndarray, "rows m"],
+    told_by: Mapping[str, float] = MappingProxyType({}),
+) -> tuple[dict[Cause, float], dict[Cause, tuple[LawAtRest, _Fitted]], float]:
+    """Probability of each cause, the best law of each, and evidence of the best over nothing [nats]; `told_by` is
+    how much likelier the course of torque is with laws that are told by it."""
+    nothing = LawAtRest(np.zeros((len(d), 0)), _NOTHING)
+    laws: list[tuple[Cause, LawAtRest]] = [(None, nothing)]
+    laws += [(effect, law) for effect in catalogue for law in effect.while_still(levels)]
+    tried = [
+        (cause, law.scaled(size, 0.5 * told_by.get(law.told_by, 1.0)))
+        for cause, law in laws
         for size in _SIZES
     ]
-    fitted = [_fitted(model, d, std, bound, links) for model in models]
-    scores = np.array([f.evidence + np.log(m.odds) for m, f in zip(models, fitted, strict=True)])
+    fitted = [_fitted(law, d, std, bound, links) for _, law in tried]
+    scores = np.array([f.evidence + np.log(law.odds) for (_, law), f in zip(tried, fitted, strict=True)])
     weights = np.exp(scores - scores.max())
     weights /= weights.sum()
-    chances: dict[str, float] = {}
-    best: dict[str, tuple[_Model, _Fitted]] = {}
+    chances: dict[Cause, float] = {}
+    best: dict[Cause, tuple[LawAtRest, _Fitted]] = {}
     for i in np.argsort(-scores):
-        model = models[i]
-        chances[model.effect] = chances.get(model.effect, 0.0) + float(weights[i])
-        best.setdefault(model.effect, (model, fitted[i]))
-    nothing = best[""][1].evidence
-    return chances, best, max(f.evidence for f in fitted) - nothing
+        cause, law = tried[i]
+        chances[cause] = chances.get(cause, 0.0) + float(weights[i])
+        best.setdefault(cause, (law, fitted[i]))
+    return chances, best, max(f.evidence for f in fitted) - best[None][1].evidence
 
 
-def _events(level: Level, arm: Arm) -> list[Finding]:
+def _events(level: Level, arm: Arm, catalogue: Sequence[type[AbstractEffect]]) -> list[Finding]:
     """A finding for all events of a recording that have the same cause."""
     edges = np.flatnonzero(np.diff(np.r_[False, level.event, False]))
     out: list[Finding] = []
     quiet = ~level.event
     if not level.event.any() or not quiet.any():
         return out
-    dof, carries = arm.dof, may_carry(arm)
-    bound, none = 2 * np.asarray(arm.frictionloss), np.zeros((dof, 0))
+    bound, none = 2 * np.asarray(arm.frictionloss), np.zeros((arm.dof, 0))
     for first, last in edges.reshape(-1, 2).tolist():
         d = level.mean[first:last].mean(0) - level.level
         std = level.long * np.sqrt(1 / (last - first) + 1 / quiet.sum())
         passes = first > 0 and last < len(level.mean)
-        prior = _PASSING if passes else _LASTING
-        free = np.diag(carries)
-        drift, held = _drifts(level, first, last), _held(level, first, last)
-        models = [
-            _Model("", none, prior[""]),
-            *_contacts(level.motion, (1 - _LEANS) * prior["external_contact"]),
-            _body([level.motion], "external_contact", _LEANS * prior["external_contact"], False),
-            _body([level.motion], "payload_change", prior["payload_change"] * held, passes),
-            _Model("torque_drift", free, prior["torque_drift"] * drift),
-            _Model("unknown", 10 * free, prior["unknown"]),
-        ]
-        chances, best, evidence = _compared(models, d, std, bound, none)
-        if chances[""] > 0.5:
+        explained = Levels([level.motion], "passing" if passes else "lasting")
+        course = {"sliding": _slides(level, first, last), "keeping": _keeps(level, first, last)}
+        compared = _compared(catalogue, explained, d, std, bound, none, course)
+        if compared[0][None] > 0.5:
             continue
         span = (float(level.start[first]), float(level.stop[last - 1]))
-        out.append(_told(chances, best, evidence, d, std, bound, [level], span))
+        out.append(_told(compared, d, std, bound, [level], span))
     return out
 
 
-def _held(level: Level, first: int, last: int) -> float:
+def _keeps(level: Level, first: int, last: int) -> float:
     """How likely a body is, by how torque varies during an event: a hand varies its force, a body does not.
 
     Likelihood ratio of the variance from block to block being what it is elsewhere, 1e-3 at least; elsewhere by
@@ -519,7 +445,7 @@ def _held(level: Level, first: int, last: int) -> float:
     return float(np.exp(-np.clip(said.max(), 0.0, 6.9)))
 
 
-def _drifts(level: Level, first: int, last: int) -> float:
+def _slides(level: Level, first: int, last: int) -> float:
     """How much likelier a slow change is than a sudden one, at the edges of an event; between 1e-6 and 1e6.
 
     The blocks about an edge as a step, against a straight line through them.
@@ -540,11 +466,14 @@ def _drifts(level: Level, first: int, last: int) -> float:
 
 
 def _steady(
-    levels: Sequence[Level], healthy: Sequence[Level], arm: Arm, knowledge: Knowledge
+    levels: Sequence[Level],
+    healthy: Sequence[Level],
+    arm: Arm,
+    knowledge: Knowledge,
+    catalogue: Sequence[type[AbstractEffect]],
 ) -> list[Finding]:
     """What stands in the level of all recordings."""
-    dof, loss = arm.dof, np.asarray(arm.frictionloss)
-    carries = may_carry(arm)
+    loss, carries = np.asarray(arm.frictionloss), may_carry(arm)
     ds, stds, bounds = [], [], []
     for level in levels:
         d, std, bound = level.level, np.hypot(level.std, _ABSOLUTE * carries), loss
@@ -560,42 +489,8 @@ def _steady(
     noise = np.maximum(np.mean([level.long for level in levels], 0), 1e-6)
     links = _distinct(felt @ inertial_spread(arm, knowledge, noise))
     rough = _distinct(2 * felt @ inertial_spread(arm, "rough", noise))
-    each, all_of = np.eye(dof), len(levels)
-    free = np.kron(np.eye(all_of), np.diag(carries))
-    bias = np.tile(np.diag(carries), (all_of, 1))
-    scales = np.repeat([_FORCE, _MOMENT], 3)
-    level_axes = _across(np.asarray(arm.chain.gravity))
-    tilt = np.concatenate([m.gravity_columns[0] @ level_axes for m in motions]) * _TILT
-    prior = _STEADY
-    lone = lambda columns, j: columns[:, [k for k in range(columns.shape[1]) if k % dof == j]]
-    models = [
-        _Model("", np.zeros((len(d), 0)), prior[""]),
-        _body(motions, "payload", prior["payload"], True),
-        _Model("inertial_parameters", rough, prior["inertial_parameters"]),
-        _Model("torque_offset", bias, 0.5 * prior["torque_offset"]),
-        _Model("coulomb_friction", free, 0.5 * prior["coulomb_friction"]),
-        _Model(
-            "gravity_direction",
-            tilt,
-            prior["gravity_direction"],
-            None,
-            (("tilt_1", "rad", _TILT), ("tilt_2", "rad", _TILT)),
-        ),
-        _Model("unknown", 10 * free, prior["unknown"]),
-    ]
-    for j in range(len(each)):
-        models.append(_Model("torque_offset", lone(bias, j), 0.5 * prior["torque_offset"] / dof, j))
-        models.append(_Model("coulomb_friction", lone(free, j), 0.5 * prior["coulomb_friction"] / dof, j))
-    for k in range(dof):
-        apart = [m.wrench_columns[0, k] * scales for m in motions]
-        wide = np.zeros((len(d), 6 * all_of))
-        for r, block in enumerate(apart):
-            wide[r * dof : (r + 1) * dof, 6 * r : 6 * r + 6] = block
-        models.append(_Model("external_contact", wide, prior["external_contact"] / dof, k))
-    chances, best, evidence = _compared(models, d, std, bound, links)
-    if chances[""] > 0.5:
-        return []
-    return [_told(chances, best, evidence, d, std, bound, levels, None)]
+    compared = _compared(catalogue, Levels(motions, "throughout", rough), d, std, bound, links)
+    return [] if compared[0][None] > 0.5 else [_told(compared, d, std, bound, levels, None)]
 
 
 def _distinct(columns: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows m"]:
@@ -604,17 +499,8 @@ def _distinct(columns: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows m
     return U * s
 
 
-def _across(gravity: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 2"]:
-    """What gravity changes by where the base tilts by 1 rad about two level axes."""
-    size = max(float(np.linalg.norm(gravity)), 1e-9)
-    _, _, Vt = np.linalg.svd(gravity[None] / size)
-    return size * Vt[1:].T
-
-
 def _told(
-    chances: Mapping[str, float],
-    best: Mapping[str, tuple[_Model, _Fitted]],
-    evidence: float,
+    compared: tuple[Mapping[Cause, float], Mapping[Cause, tuple[LawAtRest, _Fitted]], float],
     d: np.ndarray,
     std: np.ndarray,
     bound: np.ndarray,
@@ -622,23 +508,23 @@ def _told(
     span: tuple[float, float] | None,
 ) -> Finding:
     """The likeliest effect as a finding, with the others as its alternatives."""
-    ranked = sorted(((p, name) for name, p in chances.items() if name), reverse=True)
+    chances, best, evidence = compared
+    ranked = sorted(((p, cause) for cause, p in chances.items() if cause), key=lambda one: -one[0])
     confidence, effect = ranked[0]
-    model, fit = best[effect]
+    law, fit = best[effect]
     dof = levels[0].motion.dof
     beyond = np.abs(d) - bound > 2 * std
     seen = np.flatnonzero(beyond.reshape(-1, dof).any(0)).tolist()
-    joints = (model.link,) if model.link is not None else tuple(seen) or tuple(range(dof))
-    if effect == "gravity_direction":
-        joints = tuple(range(dof))
-    place = None if model.link is None else model.link + 1
-    units = model.scale * np.array([scale for _, _, scale in model.names])
+    at = tuple(range(dof)) if law.names or not seen else tuple(seen)
+    joints = at if law.link is None else (law.link,)
+    place = None if law.link is None else law.link + 1
+    units = law.scale * np.array([size for _, _, size in law.names])
     deviations = np.sqrt(np.diag(fit.covariance))
     parameters: list[dict[str, Any]] = [
         {"name": name, "joint": place, "value": float(x * size), "std": float(std * size), "unit": unit}
-        for (name, unit, _), x, std, size in zip(model.names, fit.x, deviations, units, strict=False)
+        for (name, unit, _), x, std, size in zip(law.names, fit.x, deviations, units, strict=False)
     ]
-    torque, wide = model.columns @ fit.x, np.hypot(std, bound / np.sqrt(3))
+    torque, wide = law.columns @ fit.x, np.hypot(std, bound / np.sqrt(3))
     if not parameters and len(levels) == 1:
         parameters = [
             {"name": "torque", "joint": j + 1, "value": float(torque[j]), "std": float(wide[j]),
@@ -652,26 +538,27 @@ def _told(
     )
     names = ", ".join(level.trace.name for level in levels)
     when = f"from {span[0]:.2f} to {span[1]:.2f} s " if span else ""
-    others = " or ".join(_FAMILY_SAYS[name] for p, name in ranked[1:3] if p > 0.1)
+    others = " or ".join(other.at_rest for p, other in ranked[1:3] if p > 0.1)
     summary = (
         f"In {names} the arm holds still, and {when}torque {'changes' if span else 'is off'} by {shown}"
         + (" (in the first recording)" if len(levels) > 1 else "")
-        + f", beyond what friction at rest can carry: {_FAMILY_SAYS[effect]}"
+        + f", beyond what friction at rest can carry: {effect.at_rest}"
         + (f", or {others}." if others else ".")
     )
     return Finding(
-        effect=effect,
+        effect=effect.name,
         joints=joints,
         recordings=tuple(level.trace.name for level in levels),
         intervals=None if span is None else (span,),
         confidence=confidence,
-        alternatives=tuple((name, p) for p, name in ranked[1:] if p >= _TOLD),
+        alternatives=tuple((other.name, p) for p, other in ranked[1:] if p >= _TOLD),
         equation="|tau - g(q) - tau_effect| <= frictionloss, at rest",
         parameters=tuple(parameters),
         rms_torque=rms,
         evidence=evidence,
         summary=summary,
         terms=(),
+        own_family=effect.family,
     )
 
 

@@ -17,11 +17,11 @@ import scipy.ndimage
 from jaxtyping import Float
 from scipy.signal.windows import hann
 
+from ..effects import may_carry
 from ..signals import Signals, white_noise
 from .calibration import SUREST
 from .finding import Finding, joined
 from .problem import Problem
-from .resting import may_carry
 from .state import State, coefficients, mean_squares, misfit
 from .traces import Trace
 

@@ -24,6 +24,9 @@ from .motion import Motion as Motion
 from .motion import masses as masses
 from .motion import slopes as slopes
 from .motion import smooth_torque as smooth_torque
+from .still import LawAtRest as LawAtRest
+from .still import Levels as Levels
+from .still import may_carry as may_carry
 
 CATALOGUE: tuple[type[AbstractEffect], ...] = (
     *friction.EFFECTS,

@@ -7,13 +7,20 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxpanda_kernels import link_poses
 from jaxtyping import Array, Float
 
 from ..arms.arm import Arm
 from .effect import AbstractArmEffect, Coefficient, Resistance, Shape
-from .load import window
+from .load import body_at_rest, window
 from .motion import Motion, wrench_columns
+from .still import LawAtRest, Levels
+
+_FORCE, _MOMENT = 30.0, 5.0
+"""Deviations of a force from outside [N] and of its moment [N m] on an arm that holds still."""
+_LEANS = 0.2
+"""Share of such forces that point straight down, or up, as a weight does."""
 
 
 class ExternalContact(AbstractArmEffect):
@@ -39,6 +46,7 @@ class ExternalContact(AbstractArmEffect):
     longest: ClassVar[float] = 0.8
     size_of: ClassVar[tuple[str, int]] = ("force", 3)
     repeats: ClassVar[bool] = True
+    at_rest: ClassVar[str] = "a force from outside"
 
     link: int = eqx.field(static=True)
     start: Float[Array, ""] | float
@@ -50,6 +58,28 @@ class ExternalContact(AbstractArmEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["ExternalContact"]:
         return []  # the event scan proposes them
+
+    @classmethod
+    def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
+        """A force and a moment on each link, along the base's axes; one that lasts is another in every pose."""
+        dof, poses = levels.dof, levels.poses
+        deviations = np.repeat([_FORCE, _MOMENT], 3)
+        on = [[pose.wrench_columns[0, link] * deviations for pose in poses] for link in range(dof)]
+        if levels.when == "throughout":
+            return [
+                LawAtRest(np.asarray(scipy.linalg.block_diag(*on[link])), 0.08 / dof, link)
+                for link in range(dof)
+            ]
+        odds = 0.3 if levels.when == "passing" else 0.2
+        names = tuple(
+            (f"{what}_{axis}", unit, size)
+            for what, unit, size in (("force", "N", _FORCE), ("moment", "N·m", _MOMENT))
+            for axis in "xyz"
+        )
+        pushes = [
+            LawAtRest(np.concatenate(on[link]), (1 - _LEANS) * odds / dof, link, names) for link in range(dof)
+        ]
+        return [*pushes, body_at_rest(levels, _LEANS * odds)]
 
     def variants(self, arm: Arm) -> Sequence["ExternalContact"]:
         phi = np.asarray(arm.standard[self.link])

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 from ..arms.arm import Arm
 from ..xla import filled
 from .motion import Channels, Motion
+from .still import LawAtRest, Levels
 
 Numbers = Float[Array, " n"] | Float[np.ndarray, " n"]
 """Coefficients, which may be traced."""
@@ -123,11 +124,18 @@ class AbstractEffect(eqx.Module):
     coefficients, the first ones, are components of it."""
     weakest_counts: ClassVar[bool] = False
     """Whether that size is told of the component that shows least, not of the middle one."""
+    at_rest: ClassVar[str] = ""
+    """What it is, as a sentence about an arm that holds still has it; of those that `while_still` tells of."""
 
     @classmethod
     @abc.abstractmethod
     def grid(cls, arm: Arm) -> Sequence["AbstractEffect"]:
         """Shapes and forms to try, for every joint or link it may act at."""
+
+    @classmethod
+    def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
+        """What it may be in the torque of an arm that holds still; none where nothing shows it."""
+        return ()
 
     @property
     @abc.abstractmethod

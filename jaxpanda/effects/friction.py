@@ -22,6 +22,7 @@ from .effect import (
     smooth_sign,
 )
 from .motion import Channels, Joint
+from .still import LawAtRest, Levels
 
 _WIDTH = Shape("v0", "rad/s", 1e-3, 0.3)
 
@@ -94,6 +95,7 @@ class CoulombFriction(AbstractDryFriction):
     seen_against: ClassVar[str] = "velocity"
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("v0", "rad/s", 1e-3, 0.06),)
     reveals: ClassVar[str] = "reversals, with dwells between them"
+    at_rest: ClassVar[str] = "friction that the model does not have, and that carries a load at rest"
     prior: ClassVar[float] = COMMON
 
     joint: Joint
@@ -105,6 +107,11 @@ class CoulombFriction(AbstractDryFriction):
     def grid(cls, arm: Arm) -> Sequence["CoulombFriction"]:
         form = ["signed" if level > 0 else "" for level in np.asarray(arm.frictionloss)]
         return [cls(j, v0, form[j]) for v0 in (0.003, 0.01, 0.03, 0.06) for j in range(arm.dof)]
+
+    @classmethod
+    def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
+        """Another load in every pose: at all joints, or at one."""
+        return levels.of_all_or_one(levels.free, 0.1) if levels.when == "throughout" else []
 
     @property
     def form_prior(self) -> float:

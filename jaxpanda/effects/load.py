@@ -13,11 +13,16 @@ from jaxtyping import Array, Float
 from ..arms.arm import Arm
 from .effect import AbstractArmEffect, Coefficient, Numbers, Resistance, Shape
 from .motion import Motion
+from .still import LawAtRest, Levels
 
 _MOMENTS = ("first_moment_x", "first_moment_y", "first_moment_z")
 _INERTIAS = ("inertia_xx", "inertia_xy", "inertia_yy", "inertia_xz", "inertia_yz", "inertia_zz")
 _REACH = 0.17
 """Where a payload's centre of mass is expected, along the last link's axis from its origin [m]."""
+_MASS, _WITHIN = 2.0, 0.1
+"""Deviations of a body's mass [kg] and of the place of its centre of mass [m], on an arm that holds still."""
+_TILT = 0.03
+"""Deviation of a base that is not level [rad]."""
 
 
 def _body(
@@ -65,6 +70,15 @@ def _as_body(
     return out
 
 
+def body_at_rest(levels: Levels, odds: float, *, positive: bool = False, told_by: Any = "") -> LawAtRest:
+    """A body on the last link: mass, and first moment about where it is fastened."""
+    link = levels.dof - 1
+    columns = np.concatenate([pose.regressor[0][:, 10 * link : 10 * link + 4] for pose in levels.poses])
+    names = (("mass", "kg", _MASS), *((f"mass_times_{axis}", "kg·m", _MASS * _WITHIN) for axis in "xyz"))
+    deviations = np.array([size for _, _, size in names])
+    return LawAtRest(columns * deviations, odds, link, names, positive, told_by)
+
+
 class InertialParameters(AbstractArmEffect):
     r"""Mass, centre of mass or inertia of a link differ from the model: $\tau = Y_i\,\Delta\phi_i$.
 
@@ -75,6 +89,7 @@ class InertialParameters(AbstractArmEffect):
     family: ClassVar[str] = "load"
     seen_against: ClassVar[str] = "model torque"
     reveals: ClassVar[str] = "an identification motion; a reference recording from before"
+    at_rest: ClassVar[str] = "links that differ from the model's"
 
     link: int = eqx.field(static=True)
     standard: tuple[float, ...] = eqx.field(static=True)
@@ -82,6 +97,10 @@ class InertialParameters(AbstractArmEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["InertialParameters"]:
         return [cls(i, tuple(float(v) for v in np.asarray(arm.standard[i]))) for i in range(arm.dof)]
+
+    @classmethod
+    def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
+        return [] if levels.links is None else [LawAtRest(levels.links, 0.08)]
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -128,12 +147,17 @@ class Payload(AbstractArmEffect):
     family: ClassVar[str] = "load"
     seen_against: ClassVar[str] = "model torque"
     reveals: ClassVar[str] = "a recording without the load, of the same motion"
+    at_rest: ClassVar[str] = "a body at the flange that the model does not have"
 
     link: int = eqx.field(static=True)
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["Payload"]:
         return [cls(arm.dof - 1)]
+
+    @classmethod
+    def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
+        return [body_at_rest(levels, 0.12, positive=True)] if levels.when == "throughout" else []
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -177,6 +201,7 @@ class PayloadChange(AbstractArmEffect):
     family: ClassVar[str] = "load"
     prior: ClassVar[float] = -17.0
     reveals: ClassVar[str] = "the same poses before and after"
+    at_rest: ClassVar[str] = "a body gained or lost at the flange"
     bound_to_recording: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
 
@@ -199,6 +224,13 @@ class PayloadChange(AbstractArmEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["PayloadChange"]:
         return []  # the event scan proposes them
+
+    @classmethod
+    def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
+        if levels.when == "throughout":
+            return []
+        passes = levels.when == "passing"
+        return [body_at_rest(levels, 0.1 if passes else 0.2, positive=passes, told_by="keeping")]
 
     def variants(self, arm: Arm) -> Sequence["PayloadChange"]:
         """What begins or ends may also be where a body was gained or lost for good, other recordings included."""
@@ -276,6 +308,7 @@ class GravityDirection(AbstractArmEffect):
     size_of: ClassVar[tuple[str, int]] = ("gravity", 3)
     weakest_counts: ClassVar[bool] = True
     reveals: ClassVar[str] = "the first joint turned over 180 degrees"
+    at_rest: ClassVar[str] = "a base that is not level"
 
     across: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     dof: int = eqx.field(static=True)
@@ -288,6 +321,16 @@ class GravityDirection(AbstractArmEffect):
         kept = sorted(range(3), key=lambda k: abs(along[k]))[:2]
         rows = [axes[k] / np.linalg.norm(axes[k]) for k in sorted(kept)]
         return [cls(tuple(tuple(float(v) for v in row) for row in rows), arm.dof)]
+
+    @classmethod
+    def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
+        """A tilt about two level axes."""
+        if levels.when != "throughout":
+            return []
+        gravity = np.asarray(levels.poses[0].arm.chain.gravity)
+        level = np.linalg.svd(gravity[None])[2][1:].T * np.linalg.norm(gravity)
+        columns = np.concatenate([pose.gravity_columns[0] @ level for pose in levels.poses]) * _TILT
+        return [LawAtRest(columns, 0.04, names=(("tilt_1", "rad", _TILT), ("tilt_2", "rad", _TILT)))]
 
     @property
     def joints(self) -> tuple[int, ...]:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from ..arms.arm import Arm
 from .effect import COMMON, AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape, settling
 from .motion import Channels, Joint, Motion
+from .still import LawAtRest, Levels
 from .twist import low_passed
 
 
@@ -23,6 +24,7 @@ class TorqueOffset(AbstractInstantEffect):
     name: ClassVar[str] = "torque_offset"
     family: ClassVar[str] = "sensor"
     reveals: ClassVar[str] = "rests, and poses on both sides of the joint's zero of gravity"
+    at_rest: ClassVar[str] = "a bias of the torque sensors"
     prior: ClassVar[float] = COMMON
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
@@ -31,6 +33,11 @@ class TorqueOffset(AbstractInstantEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["TorqueOffset"]:
         return [cls(j) for j in range(arm.dof)]
+
+    @classmethod
+    def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
+        """The same in every pose: of all sensors, or of one."""
+        return levels.of_all_or_one(levels.alike, 0.06) if levels.when == "throughout" else []
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -105,6 +112,7 @@ class TorqueDrift(AbstractInstantEffect):
     prior: ClassVar[float] = -17.0
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("time_constant", "s", 0.5, 2000.0),)
     reveals: ClassVar[str] = "the same poses early and late"
+    at_rest: ClassVar[str] = "a torque sensor that drifts"
     drifts: ClassVar[bool] = True
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
@@ -118,6 +126,10 @@ class TorqueDrift(AbstractInstantEffect):
         shapes = [(form, T) for form in ("extra", "offset") for T in (2.0, 6.0, 20.0, 500.0)]
         shapes += [(form, T) for form in ("wave", "wandering") for T in (6.0, 10.0, 16.0, 30.0, 60.0)]
         return [cls(j, T, form) for form, T in shapes for j in range(arm.dof)]
+
+    @classmethod
+    def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
+        return [] if levels.when == "throughout" else [LawAtRest(levels.free, 0.05, told_by="sliding")]
 
     def beyond(self, recorded: Sequence[Channels]) -> "TorqueDrift":
         return dataclasses.replace(self, until=max(float(s.t[-1]) for s in recorded))

@@ -22,6 +22,7 @@ from .effect import (
     smooth_sign,
 )
 from .motion import Channels, Joint, Motion, gravity_columns, wrench_columns
+from .still import LawAtRest, Levels
 
 FREE = -21.0
 """Prior of a torque that has no law."""
@@ -69,6 +70,7 @@ class Unknown(AbstractInstantEffect):
     free: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
     reveals: ClassVar[str] = "single-joint motions that vary the channel it depends on and nothing else"
+    at_rest: ClassVar[str] = "torque that none of these explains"
 
     joint: Joint
     source: Joint
@@ -82,6 +84,11 @@ class Unknown(AbstractInstantEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["Unknown"]:
         return []  # its knots depend on the recordings
+
+    @classmethod
+    def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
+        """Any torque, ten times as large as friction would be."""
+        return [LawAtRest(10 * levels.free, 0.02 if levels.when == "throughout" else 0.05)]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
