@@ -1,4 +1,5 @@
-r"""Of the bodies that can be built, those that the recordings are likeliest with.
+r"""Of the bodies that can be built, and of numbers that are not negative, those that the recordings are likeliest
+with.
 
 A law that adds a body is linear in its standard parameters, and a Gaussian prior lets them be anyone's. A body's
 pseudo-inertia is positive, $J(c) = \sum_k c_k J_k \succ 0$ (Wensing, Kim, Slotine, RA-L 2018). With the
@@ -8,18 +9,22 @@ $$\min_c\; \tfrac12 (c - \hat c)^\top C^{-1} (c - \hat c) - \mu \sum_{bodies} \l
 
 for falling $\mu$ (Boyd and Vandenberghe, Convex Optimization 2004, ch. 11). `feasible.nearest` does the like for
 the links of an arm by their factors; for one body that is slower, and may end where no step helps.
+
+A number of the user's file that laws correct, as a rotor's inertia or a level of friction, is the same with a
+matrix of one entry, $v + \sum_k c_k \ge 0$.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 from jaxpanda_kernels.inertia import pseudo_inertia
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,12 +53,72 @@ def body(directions: Float[np.ndarray, "10 n"]) -> Body:
     return Body(steps, np.linalg.lstsq(steps.reshape(-1, 16).T, inside.ravel(), rcond=None)[0])
 
 
+@dataclasses.dataclass(frozen=True)
+class Correction:
+    """A coefficient that is added to a number of the user's model, which is not negative with it."""
+
+    of: tuple[str, int]
+    """The number's name, and its joint."""
+    value: float
+    """The user's."""
+    size: float = 1.0
+    """By how much one of the coefficient changes it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """How much less likely coefficients get beside the likeliest, for what they may not be."""
+
+    at: Int[np.ndarray, " m"]
+    """Which coefficients."""
+    curvature: Float[np.ndarray, "m m"]
+    """Of that: where a step is barred it has next to none to go."""
+
+
+def at_bounds(
+    x: Float[np.ndarray, " n"],
+    solve: Callable[[np.ndarray], np.ndarray],
+    numbers: Sequence[Mapping[int, Correction]],
+) -> tuple[Float[np.ndarray, " n"], float, Callable[[np.ndarray], np.ndarray], list[Kept]]:
+    r"""Coefficients with which no number is negative, what they cost [nats], what multiplies by the covariance of
+    those that leave the numbers that are zero at that, and what keeps them so.
+
+    With $v + A c \ge 0$ they are $\hat c + C A^\top \lambda$, where $\lambda \ge 0$ makes
+    $\tfrac12 \lambda^\top A C A^\top \lambda + \lambda^\top (v + A \hat c)$ least (Lawson and Hanson, Solving
+    Least Squares Problems 1974).
+
+    Args:
+        x: the likeliest of all.
+        solve: multiplies by their covariance.
+        numbers: of each, what coefficients add to it.
+    """
+    A = np.zeros((len(numbers), len(x)))
+    for row, parts in zip(A, numbers, strict=True):
+        row[[*parts]] = [one.size for one in parts.values()]
+    found = np.array([next(iter(parts.values())).value for parts in numbers]) + A @ x
+    if not np.any(found < 0):
+        return x, 0.0, solve, []
+    wide = solve(A.T)
+    C = A @ wide
+    unit = 1 / np.sqrt(np.diag(C))
+    root = np.linalg.cholesky(unit[:, None] * C * unit + _ROUNDING * np.eye(len(C)))
+    pull, _ = scipy.optimize.nnls(root.T, scipy.linalg.solve_triangular(root, -found * unit, lower=True))
+    pull *= unit
+    zero = np.flatnonzero(pull > 0)
+    at = np.flatnonzero(np.any(A[zero] != 0, 0))
+    held, there = A[np.ix_(zero, at)], wide[:, zero]
+    factor = scipy.linalg.cho_factor(C[np.ix_(zero, zero)], lower=True)
+    among = lambda y: solve(y) - there @ scipy.linalg.cho_solve(factor, there.T @ y)
+    kept = Kept(at, held.T @ (_STIFF * unit[zero, None] ** 2 * held))
+    return x + wide @ pull, 0.5 * float(pull @ C @ pull), among, [kept]
+
+
 def likeliest(
     x: Float[np.ndarray, " n"],
     solve: Callable[[np.ndarray], np.ndarray],
     bodies: Sequence[tuple[slice, Body]],
-) -> tuple[Float[np.ndarray, " n"], float]:
-    """Coefficients whose bodies can be built, and what they cost [nats].
+) -> tuple[Float[np.ndarray, " n"], float, list[Kept]]:
+    """Coefficients whose bodies can be built, what they cost [nats], and what keeps them so.
 
     Args:
         x: the likeliest of all.
@@ -61,7 +126,7 @@ def likeliest(
         bodies: and where their coefficients are.
     """
     if all(np.linalg.eigvalsh(b.at(x[at]))[0] >= 0 for at, b in bodies):
-        return x, 0.0
+        return x, 0.0, []
     at = np.concatenate([np.arange(where.start, where.stop) for where, _ in bodies])
     wide = solve(np.eye(len(x))[:, at])
     C = wide[at]
@@ -76,7 +141,10 @@ def likeliest(
     start = np.concatenate([b.begin for _, b in bodies]) - x[at]
     z = _inside(blocks, scipy.linalg.solve_triangular(root, start, lower=True))
     weights = scipy.linalg.solve_triangular(root, z, lower=True, trans=1)
-    return x + wide @ weights, 0.5 * float(z @ z)
+    *_, curvature = _barrier(blocks, z, _PRICE, derivatives=True)
+    half = scipy.linalg.solve_triangular(root, curvature - np.eye(len(z)), lower=True, trans=1)
+    kept = Kept(at, scipy.linalg.solve_triangular(root, half.T, lower=True, trans=1))
+    return x + wide @ weights, 0.5 * float(z @ z), [kept]
 
 
 Blocks = Sequence[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "n 4 4"]]]
@@ -125,6 +193,8 @@ def _barrier(
 
 
 _ROUNDING = 1e-9
+_STIFF = 1e6
+"""By how many times what holds a number at zero is stiffer than what tells of it."""
 _INSIDE = 1e-3
 """Least eigenvalue of the body that a search begins from, as a share of the largest."""
 _PRICE, _FALL = 0.01, 10.0

@@ -237,7 +237,9 @@ def _finding(
         ((n, sure * p) for n, p in rivals[clearest][1].items() if n not in same and sure * p >= _LISTED),
         key=lambda pair: -pair[1],
     )
-    summary = _summary(name, joints, rms, intervals, names, alternatives, problem, own, "; ".join(equations))
+    numbers = [one for i in members for one in _corrected(problem, state, i)]
+    said = name, joints, rms, intervals, names, alternatives, problem, own, "; ".join(equations), numbers
+    summary = _summary(*said)
     if name == CoulombFriction.name and any(isinstance(t.effect, PreslidingHysteresis) for t in terms):
         summary += " Its equation has it stick at rest, as MuJoCo's frictionloss does."
     return Finding(
@@ -289,7 +291,31 @@ def _intervals(problem: Problem, terms: Sequence[Term]) -> tuple[tuple[float, fl
     return joined(spans, _TOUCHING)
 
 
-def _summary(name, joints, rms, intervals, recordings, alternatives, problem, own, equation) -> str:
+Number = tuple[str, int, float, float, str]
+"""One of the user's model, its joint, the model's value and the recordings', and the unit."""
+
+
+def _corrected(problem: Problem, state: State, i: int) -> list[Number]:
+    """Numbers of the user's model that a term corrects; none where it is more than that."""
+    term = state.terms[i]
+    laws, values = term.effect.coefficients, coefficients(state, i)
+    if len(term.corrections) < len(laws):
+        return []
+    unit = lambda k: term.effect.unit(laws[k].unit, problem.arm)
+    known = {k: one for k, one in term.corrections.items() if one.value > 0}
+    return [(*one.of, one.value, max(one.value + float(values[k]), 0.0), unit(k)) for k, one in known.items()]
+
+
+def _wrong_number(numbers: Sequence[Number], strongest: int) -> tuple[str, str]:
+    """That a number of the user's model is wrong, and what it should be where that shows most."""
+    ups = [new > old for _, _, old, new, _ in numbers]
+    how = "too small" if all(ups) else "not this arm's" if any(ups) else "too large"
+    where = next((one for one in numbers if one[1] == strongest), None)
+    closing = "" if where is None else f", where {where[2]:.3g} should be {where[3]:.2g} {where[4]}"
+    return f"The simulation's {numbers[0][0]} is {how}", closing
+
+
+def _summary(name, joints, rms, intervals, recordings, alternatives, problem, own, equation, numbers) -> str:
     """One or two plain sentences."""
     strongest = int(np.argmax(rms))
     size = f"{rms[strongest]:.3g} {problem.arm.unit('N·m', strongest)} rms"
@@ -307,10 +333,10 @@ def _summary(name, joints, rms, intervals, recordings, alternatives, problem, ow
     when = ""
     if intervals is not None:
         when = " in " + recordings[0] + " from " + ", ".join(f"{a:.2f} s to {b:.2f} s" for a, b in intervals)
-    text = (
-        f"The simulation is missing {name.replace('_', ' ')}{where}{when}: up to {size},"
-        f" at joint {strongest + 1}."
-    )
+    opening, closing = f"The simulation is missing {name.replace('_', ' ')}", ""
+    if {at for _, at, *_ in numbers} == set(joints):
+        opening, closing = _wrong_number(numbers, strongest)
+    text = f"{opening}{where}{when}: up to {size}, at joint {strongest + 1}{closing}."
     if alternatives and own < 0.9:
         rival = alternatives[0][0]
         cls = next(c for c in problem.catalogue if c.name == name)

@@ -15,7 +15,7 @@ forward regression, and Bayesian model selection.
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ import scipy.sparse
 import scipy.special
 from jaxtyping import Bool, Float, Int
 
-from .bodies import likeliest
+from .bodies import Body, Correction, Kept, at_bounds, likeliest
 
 SCALES = (1.0, 4.0, 16.0)
 """Sizes of an effect over the noise, per sample, that are expected alike."""
@@ -269,8 +269,10 @@ class Design:
         precision: Float[np.ndarray, " n"],
         normal: tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]] | None = None,
         terms: Sequence[Any] = (),
+        corrections: Mapping[int, Correction] | None = None,
     ):
-        """`normal` holds $A^\\top A$ and $A^\\top r$ where they are known; `terms` made the last columns."""
+        """`normal` holds $A^\\top A$ and $A^\\top r$ where they are known; `terms` made the last columns, and
+        `corrections` says which of the others change a number that is not negative."""
         if not isinstance(columns, Columns):
             ends = len(precision) - np.cumsum([0, *(t.width for t in reversed(terms))])[::-1]
             each = [slice(int(a), int(b)) for a, b in itertools.pairwise([0, *ends])]
@@ -278,6 +280,7 @@ class Design:
                 [[(at, A[:, at]) for at in each] for A in columns], len(residual[0]), len(precision)
             )
         self.columns, self.residual, self.precision, self.terms = columns, residual, precision, tuple(terms)
+        self.corrections = corrections or {}
         if normal is None:
             pairs = list(zip(columns, residual, strict=True))
             normal = np.asarray(sum(A.T @ A for A, _ in pairs)), np.asarray(sum(A.T @ r for A, r in pairs))
@@ -285,24 +288,40 @@ class Design:
         self.information, self.g = normal[0] + np.diag(precision), normal[1]
         self.factor = scipy.linalg.cho_factor(self.information, lower=True) if len(self.g) else None
         free = self.solve(self.g)
-        self.x, cost = self.admissible(free, self.solve)
+        self.x, cost, self.kept = self.admissible(free, self.solve)
         # by how much the data are likelier than without coefficients
         self.fitted = 0.5 * self.g @ free - cost
 
     def admissible(
         self, x: Float[np.ndarray, " n"], solve: Callable[[np.ndarray], np.ndarray]
-    ) -> tuple[Float[np.ndarray, " n"], float]:
-        """The likeliest coefficients whose bodies can be built, and what that costs [nats].
+    ) -> tuple[Float[np.ndarray, " n"], float, list[Kept]]:
+        """The likeliest coefficients whose bodies can be built, and with which no number of the user's arm that
+        they correct is negative; what that costs [nats], and what keeps them so.
 
         x: the likeliest of all; `solve`: multiplies by their covariance.
         """
-        ends = len(x) - sum(t.width for t in self.terms) + np.cumsum([0, *(t.width for t in self.terms)])
-        held = [
-            (slice(int(at), int(at) + len(t.deviation)), t.body)
-            for at, t in zip(ends, self.terms, strict=False)
-            if t.body is not None
-        ]
-        return likeliest(x, solve, held) if held else (x, 0.0)
+        bodies, numbers = self._bounds
+        bound = at_bounds(x, solve, numbers) if numbers else (x, 0.0, solve, [])
+        x, cost, solve, kept = bound
+        if not bodies:
+            return x, cost, kept
+        x, more, kept_too = likeliest(x, solve, bodies)
+        return x, cost + more, [*kept, *kept_too]
+
+    @functools.cached_property
+    def _bounds(self) -> tuple[list[tuple[slice, Body]], list[dict[int, Correction]]]:
+        """Which coefficients are bodies; and of each number that some correct, which do."""
+        place, bodies = len(self.precision) - sum(t.width for t in self.terms), []
+        corrections = dict(self.corrections)
+        for term in self.terms:
+            if term.body is not None:
+                bodies.append((slice(place, place + len(term.deviation)), term.body))
+            corrections |= {place + k: one for k, one in term.corrections.items()}
+            place += term.width
+        numbers: dict[tuple[str, int], dict[int, Correction]] = {}
+        for at, one in corrections.items():
+            numbers.setdefault(one.of, {})[at] = one
+        return bodies, [*numbers.values()]
 
     def without(self, i: int) -> "Design":
         """The model less one of its terms."""
@@ -311,7 +330,8 @@ class Design:
         kept[gone] = False
         normal = self.normal[0][np.ix_(kept, kept)], self.normal[1][kept]
         others = (*self.terms[:i], *self.terms[i + 1 :])
-        return Design(self.columns.without(gone), self.residual, self.precision[kept], normal, others)
+        columns, precision = self.columns.without(gone), self.precision[kept]
+        return Design(columns, self.residual, precision, normal, others, self.corrections)
 
     @functools.cached_property
     def left(self) -> list[Float[np.ndarray, " rows"]]:
@@ -339,10 +359,22 @@ class Design:
         return self._roots[joint] @ F
 
     def lowered(self, F: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
-        r"""$L^{-1} F$ with $L L^\top = H$."""
+        r"""$L^{-1} F$ with $L L^\top = H$, that of coefficients which stay what can be built."""
         if self.factor is None:
             return F
-        return scipy.linalg.solve_triangular(self.factor[0], F, lower=True, check_finite=False)
+        return scipy.linalg.solve_triangular(self._bounded, F, lower=True, check_finite=False)
+
+    @functools.cached_property
+    def _bounded(self) -> Float[np.ndarray, "n n"]:
+        """Beside a bound what is left of a residual is not orthogonal to the columns of what is held there:
+        another law takes it without them."""
+        assert self.factor is not None
+        if not self.kept:
+            return self.factor[0]
+        H = self.information.copy()
+        for held in self.kept:
+            H[np.ix_(held.at, held.at)] += held.curvature
+        return scipy.linalg.cho_factor(H, lower=True)[0]
 
     @property
     def covariance(self) -> Float[np.ndarray, "n n"]:

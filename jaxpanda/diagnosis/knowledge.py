@@ -19,6 +19,7 @@ from jaxtyping import Float
 from ..arms.arm import Arm
 from ..errors import InputError
 from ..parameters import random_regressor
+from .bodies import Correction
 from .discrepancy import of_known
 from .traces import Trace
 
@@ -74,12 +75,18 @@ def nuisance(
     knowledge: Knowledge,
     std: Float[np.ndarray, " dof"],
     scale: float = 1.0,
-) -> tuple[list[Float[np.ndarray, "_time dof _n"]], int]:
-    """The columns N of each recording, and how many of them are numbers of the model; the others are what its
-    friction may be off and noise of the encoders, which no knowledge takes away. `std`: of the noise [N m];
-    `scale` multiplies the uncertainty of friction and rotors where it is "rough"."""
+) -> tuple[list[Float[np.ndarray, "_time dof _n"]], int, dict[int, Correction]]:
+    """The columns N of each recording, how many of them are numbers of the model, and which of these are not to
+    be negative; the others are what its friction may be off and noise of the encoders, which no knowledge takes
+    away. `std`: of the noise [N m]; `scale` multiplies the uncertainty of friction and rotors where it is
+    "rough"."""
     arm = traces[0].motion.arm
-    damping, level, armature = friction_spread(arm, knowledge, scale)
+    damping, level, armature = spreads = friction_spread(arm, knowledge, scale)
+    held = [
+        Correction((name, int(j)), float(np.asarray(getattr(arm, name))[j]), float(spread[j]))
+        for name, spread in zip(("damping", "frictionloss", "armature"), spreads, strict=True)
+        for j in np.flatnonzero(spread > 0)
+    ]
     out, numbers = [], 0
     for trace, off in zip(traces, of_known(traces, std), strict=True):
         parts = [trace.motion.regressor @ spread]
@@ -93,7 +100,7 @@ def nuisance(
             parts.append((armature[j] * trace.motion.qdd)[:, :, None] * joints[:, j : j + 1])
         numbers = sum(p.shape[2] for p in parts)
         out.append(np.concatenate([*parts, off, _SHAKEN * trace.shaken], 2))
-    return out, numbers
+    return out, numbers, dict(enumerate(held, spread.shape[1]))
 
 
 def friction_spread(

@@ -445,15 +445,20 @@ def _replays(found: Diagnosis, names: Sequence[str]) -> Section:
             for what in ("rmse_rad", "feedback_rms")
             for when in ("before", "after")
         }
-        tables.append(summaries.by_joint(f"{one.get('recording', '')}: replayed in MuJoCo", names, columns))
-    return Section(
-        "Simulated again",
-        [
-            "Your simulation and the corrected one follow the recorded motion under the recorded torque and the"
-            " same weak feedback."
-        ],
-        tables,
-    )
+        if any(values is not None for values in columns.values()):
+            caption = f"{one.get('recording', '')}: replayed in MuJoCo"
+            tables.append(summaries.by_joint(caption, names, columns))
+    said = [
+        "Your simulation and the corrected one follow the recorded motion under the recorded torque and the"
+        " same weak feedback."
+    ]
+    said += [
+        f"{one.get('recording', '')}: {which} ran away."
+        for one in found.replays
+        for which, when in (("your simulation", "before"), ("the corrected one", "after"))
+        if one.get(f"rmse_rad_{when}") is None
+    ]
+    return Section("Simulated again", said, tables)
 
 
 def _question(told: Told) -> str:

@@ -72,8 +72,9 @@ def pose(
     empty = Problem(traces, active, nothing, saturated=saturated)
     std = empty.noise(()).std
     spread = scale * knowledge_.inertial_spread(arm, knowledge, std)
-    columns, numbers = knowledge_.nuisance(traces, spread, knowledge, std, scale)
-    problem = posed(traces, active, columns, background, empty.saturation, numbers, catalogue, shapes)
+    columns, numbers, corrections = knowledge_.nuisance(traces, spread, knowledge, std, scale)
+    known = background, empty.saturation, numbers, corrections
+    problem = posed(traces, active, columns, *known, catalogue, shapes)
     return Premises(problem, spread, knowledge, scale, problem.background)
 
 

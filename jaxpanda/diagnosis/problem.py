@@ -5,7 +5,7 @@ import functools
 import itertools
 import operator
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from .. import signals as signals_
 from ..arms.arm import Arm
 from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect, Channels, Stretches, joint_columns
 from ..errors import InputError
-from .bodies import Body, body
+from .bodies import Body, Correction, body
 from .discrepancy import at_rest, known_at_rest, of_law, resting, unresolved, unresolved_known
 from .evidence import Columns, Design, Noise
 from .grid import Grid
@@ -49,6 +49,8 @@ class Term:
     """Square of what it may be off for as long as a joint rests, likewise [N² m²]."""
     prior: float = 0.0
     """Logarithm of its prior odds, less what the search over its shapes has cost [nats]."""
+    corrected: tuple[float, ...] = ()
+    """Of each coefficient the number of the user's arm that it corrects; 0 for none."""
 
     @property
     def law(self) -> "Term":
@@ -72,6 +74,16 @@ class Term:
         if self.effect.body is None or len(self.deviation) != len(self.effect.coefficients):
             return None
         return body(self.effect.body)
+
+    @functools.cached_property
+    def corrections(self) -> dict[int, Correction]:
+        """Which coefficients correct a number of the user's arm; none of the tangent of a shape."""
+        laws = self.effect.coefficients
+        if len(self.deviation) != len(laws):
+            return {}
+        each = enumerate(zip(laws, self.corrected, strict=False))
+        named = lambda law: (law.beyond, self.effect.joints[0])
+        return {k: Correction(named(law), value) for k, (law, value) in each if law.beyond}
 
     @property
     def width(self) -> int:
@@ -111,6 +123,8 @@ class Problem:
     """Effects that are known already: their columns are in the nuisance, and count as signal in the noise."""
     numbers: int | None = None
     """How many columns of the nuisance, the first ones, are numbers of the user's model."""
+    corrections: Mapping[int, Correction] = dataclasses.field(default_factory=dict)
+    """Which of these change a number that is not negative."""
     saturated: Saturation | None = dataclasses.field(default=None, repr=False, compare=False)
     """That of the same recordings, where a problem posed otherwise has made it already."""
     catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE
@@ -203,13 +217,13 @@ class Problem:
         """The effect's columns in all recordings; with its discrepancy, if coefficients and noise are known."""
         columns = tuple(self.full_columns(effect))
         if c is None or std is None:
-            return Term(effect, columns, deviation, prior=prior)
+            return Term(effect, columns, deviation, prior=prior, corrected=effect.corrected(self.arm))
         torque = [x @ c for x in columns]
         evaluate = lambda other: [x @ c for x in self.full_columns(other)]
         off = tuple(of_law(self.traces, effect, torque, std, evaluate))
         traces = self.traces
-        rests = at_rest(traces, effect, torque)
-        return Term(effect, columns, deviation, off, unresolved(traces, torque), rests, prior)
+        rests, held = at_rest(traces, effect, torque), effect.corrected(self.arm)
+        return Term(effect, columns, deviation, off, unresolved(traces, torque), rests, prior, held)
 
     def full_columns(self, effect: AbstractEffect) -> list[Float[np.ndarray, "_time dof _n"]]:
         """Columns of an effect, at all joints."""
@@ -368,7 +382,8 @@ class Problem:
         precision = np.concatenate([np.ones(counts[0]), *(t.precision for t in terms)])
         parts = [[(at, x) for key, at in place.items() if (x := h.rows(key)) is not None] for h in joints]
         columns = Columns(parts, len(joints[0].residual), int(ends[-1]))
-        return Design(columns, [h.residual for h in joints], precision, (H, g), terms)
+        residual = [h.residual for h in joints]
+        return Design(columns, residual, precision, (H, g), terms, self.corrections)
 
     @functools.cached_property
     def _resting(self) -> list[tuple[int, Callable, np.ndarray, np.ndarray]]:
@@ -594,13 +609,21 @@ def posed(
     background: Sequence[Term] = (),
     saturated: Saturation | None = None,
     numbers: int | None = None,
+    corrections: Mapping[int, Correction] | None = None,
     catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE,
     shapes: Grid | None = None,
 ) -> Problem:
     """A problem whose background acts in all recordings: its columns, by their deviations, end the nuisance."""
     everywhere = Problem(traces, (True,) * len(traces), tuple(nuisance))
     terms = tuple(everywhere.term(t.effect, t.deviation) for t in background)
+    corrections, place = dict(corrections or {}), nuisance[0].shape[2]
+    for t in terms:
+        sizes = t.deviation
+        corrections |= {
+            place + k: dataclasses.replace(one, size=float(sizes[k])) for k, one in t.corrections.items()
+        }
+        place += len(sizes)
     wide = [
         np.concatenate([n, *(t.columns[r] * t.deviation for t in terms)], 2) for r, n in enumerate(nuisance)
     ]
-    return Problem(traces, active, tuple(wide), terms, numbers, saturated, catalogue, shapes)
+    return Problem(traces, active, tuple(wide), terms, numbers, corrections, saturated, catalogue, shapes)

@@ -286,7 +286,8 @@ def leftover(problem: Problem, state: State) -> tuple[Float[np.ndarray, " dof"],
     them."""
     design = state.design
     kept = np.arange(len(design.precision)) < len(design.precision) - sum(t.width for t in state.terms)
-    bare = Design([A[:, kept] for A in design.columns], design.residual, design.precision[kept])
+    columns, known = [A[:, kept] for A in design.columns], design.corrections
+    bare = Design(columns, design.residual, design.precision[kept], corrections=known)
     before, after = (
         mean_squares(problem, problem.noise(state.terms), terms, d.x) - 1
         for terms, d in (((), bare), (state.terms, design))

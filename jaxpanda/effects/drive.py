@@ -45,7 +45,8 @@ class Armature(AbstractInstantEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        return (Coefficient("armature", "kg·m²", sign=0 if self.form else 1),)
+        sign, beyond = (0, "armature") if self.form else (1, "")
+        return (Coefficient("armature", "kg·m²", sign, beyond),)
 
     @property
     def equation(self) -> str:
