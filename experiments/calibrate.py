@@ -17,13 +17,13 @@ import scipy.special
 from scipy.optimize import minimize
 from scoring import SURE, calibration_error, claims_of, is_allowed, is_right, truth_places
 
-from jaxpanda.diagnosis.calibration import WEIGHTS, features, weight_of
+from jaxpanda.diagnosis.calibration import UNTOLD, WEIGHTS, features, weight_of
 
 FOLDS = 10
 RIDGE = 3.0
 """On what the weights differ by from those of today, which are of hundreds of findings: a few dozen cases correct
 them."""
-SIGNS = (0, 1, 1, 1, 1, -1, -1)
+SIGNS = (0, 1, 1, 1, 1, -1, -1, 1)
 """Of the weights: more of what speaks for a finding never makes less sure."""
 
 
@@ -35,11 +35,14 @@ def judged(case: Path, answer: Path) -> tuple[np.ndarray, np.ndarray]:
     if not findings:
         return np.zeros((0, len(WEIGHTS))), np.zeros(0)
     fit = said["fit"]
-    sizes = np.array([f["rms_torque"] for f in findings])
-    sizes /= np.maximum(fit["held_out_rmse_after"], fit["noise_floor"])
+    error = np.maximum(fit["held_out_rmse_after"], fit["noise_floor"])
+    sizes = np.array([f["rms_torque"] for f in findings]) / error
     foretold = [f["evidence_nats"] if f["held_out_nats"] is None else f["held_out_nats"] for f in findings]
     at_times = np.array([bool(f["parameters"]) and f["intervals"] is not None for f in findings])
-    first, *others = features(sizes, np.array(foretold), said["verdict"] == "explained", at_times).T
+    told = [f.get("rms_torque_std") or np.array(f["rms_torque"]) / UNTOLD for f in findings]
+    first, *others = features(
+        sizes, np.array(foretold), said["verdict"] == "explained", at_times, np.array(told) / error
+    ).T
     weight = [weight_of(f["confidence"] if f.get("posterior") is None else f["posterior"]) for f in findings]
     right = np.array([is_right(places, f) for f in findings])
     allowed = [all(is_allowed(truth, claim) for claim in claims_of(f)) for f in findings]

@@ -31,6 +31,7 @@ def found(rms_torque, confidence=0.9, alternatives=(("armature", 0.08),), foreto
         summary="",
         terms=(0,),
         foretold=foretold,
+        torque_std=0.1 * np.array(rms_torque),
     )
 
 
@@ -57,8 +58,22 @@ def test_what_acts_for_a_while_only_is_doubted():
 
 
 def test_torque_that_is_small_beside_what_stays_wrong_elsewhere_is_doubted():
-    clear, small = (sure([found([1.0, 0.0])], held_out=np.array([x, 0.2]))[0] for x in (0.1, 1.0))
+    one = found([1.0, 0.0])
+    unsure = lambda x: dataclasses.replace(
+        one, torque_std=np.array([0.5 * x, 0.0])
+    )  # may have taken in half of it
+    clear, small = (sure([unsure(x)], held_out=np.array([x, 0.2]))[0] for x in (0.1, 1.0))
     assert small < clear - 0.3
+
+
+def test_torque_that_is_not_clear_of_what_it_may_be_off_is_doubted():
+    one = found([1.0, 0.0])
+    clear, unclear, not_at_all = (
+        sure([dataclasses.replace(one, torque_std=one.rms_torque / z)])[0] for z in (10.0, 2.0, 0.5)
+    )
+    assert 1 - unclear > 1.5 * (1 - clear)
+    assert 1 - not_at_all > 1.5 * (1 - unclear)
+    assert sure([dataclasses.replace(one, torque_std=None)])[0] < clear
 
 
 def test_what_does_not_help_where_it_was_not_fitted_is_doubted():

@@ -84,6 +84,15 @@ def test_its_parameters_come_back(found):
     assert parameters["stribeck_velocity"] == pytest.approx(0.1, abs=0.03)
 
 
+def test_its_torque_is_off_by_what_is_said_of_it(found):
+    (finding,), motion = found.findings, found.problem.traces[0].motion
+    weight = found.problem.traces[0].weights[:, 4] * (np.abs(motion.qd[:, 4]) > 0.2)  # filters blur reversals
+    true = at_joint(5, stribeck)(motion.time, motion.q, motion.qd, motion.qdd)[:, 4]
+    off = np.sqrt(np.average((torque(found.kept, 0)[0][:, 4] - true) ** 2, weights=weight))
+    assert 0.3 * finding.torque_std[4] < off < 3 * finding.torque_std[4] < finding.rms_torque[4]
+    np.testing.assert_array_equal(np.delete(finding.torque_std, 4), 0)
+
+
 def test_the_error_falls_to_the_noise_on_what_was_held_out(found):
     fit = found.fit
     assert fit.held_out_rmse_before[4] > 3 * fit.noise_floor[4]

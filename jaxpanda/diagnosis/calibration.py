@@ -3,17 +3,19 @@ r"""From the weights of the models that were compared to a probability of being 
 The models compared are those of the catalogue, each with one other term in a place. What the catalogue lacks is
 not among them, so that their weights are too sure: most where something stays unexplained; where a law is small
 beside others at its joint, or beside what the model gets wrong of torque that it was not fitted to, and may be
-what those are off by; and where it acts for a while only, when nothing else in the recordings tests it. How often
-findings like this one are right was counted in trials, simulated ones and on recordings of real arms, and a
-logistic regression on the count (Platt, Advances in Large Margin Classifiers 1999) says
+what those are off by; where its torque is not clear of what its coefficients may be off; and where it acts for a
+while only, when nothing else in the recordings tests it. How often findings like this one are right was counted
+in trials, simulated ones and on recordings of real arms, and a logistic regression on the count (Platt, Advances
+in Large Margin Classifiers 1999) says
 
-$$\operatorname{logit} P
-  = w_0 + w_1 \operatorname{logit} p + w_2 \log_{10} s + w_3 \log_{10} a + w_4 f + w_5 u + w_6 e$$
+$$\operatorname{logit} P = w_0 + w_1 \operatorname{logit} p
+  + w_2 \log_{10} s + w_3 \log_{10} a + w_4 f + w_5 u + w_6 e + w_7 \log_{10} z$$
 
 with p the weight; s the finding's share of the squared torque of all findings at the joint where it stands out
 most; a its torque there over the held-out error; $f = \operatorname{sgn}(F) \log_{10}(1 + |F|)$ of the nats F by
 which it makes torque likelier that nothing was fitted to (`Finding.foretold`); u whether something is left
-unexplained; and e whether it is a law that acts in an interval only. `experiments/calibrate.py` fits w.
+unexplained; e whether it is a law that acts in an interval only; and z its torque there over the deviation of
+that (`Finding.torque_std`). `experiments/calibrate.py` fits w.
 """
 
 import dataclasses
@@ -25,14 +27,18 @@ from jaxtyping import Bool, Float
 
 from .finding import Finding, Fit
 
-WEIGHTS = (-1.05, 0.09, 0.0, 2.19, 0.93, -0.91, -1.4)
-"""$w_0 \\ldots w_6$."""
+WEIGHTS = (-1.68, 0.09, 0.0, 2.19, 0.93, -0.91, -1.4, 0.9)
+"""$w_0 \\ldots w_7$."""
 SUREST = 0.995
 """No finding is surer."""
 TOLD, SMALL = 0.25, 2.0
 """Confidence from which a finding is told, as one that is missed costs three times what a false one does; and
 torque over the noise up to which it is small."""
 _LEAST_SHARE, _LEAST_SIZE = 1e-4, 1e-2
+_CLEAR = 0.3, 30.0
+"""Deviations that a torque may be clear by, beyond which it makes no difference."""
+UNTOLD = 5.0
+"""The same of a torque whose deviation nobody knows."""
 
 
 def calibrated(findings: Sequence[Finding], verdict: str, fit: Fit) -> list[Finding]:
@@ -49,7 +55,8 @@ def calibrated(findings: Sequence[Finding], verdict: str, fit: Fit) -> list[Find
     sizes = np.stack([f.rms_torque for f in findings]) / _error(fit)
     foretold = [f.evidence if f.foretold is None else f.foretold for f in findings]
     at_times = np.array([bool(f.parameters) and f.intervals is not None for f in findings])
-    x = features(sizes, np.array(foretold), verdict == "explained", at_times)
+    unsure = [f.rms_torque / UNTOLD if f.torque_std is None else f.torque_std for f in findings]
+    x = features(sizes, np.array(foretold), verdict == "explained", at_times, np.stack(unsure) / _error(fit))
     return [_calibrated(f, of_one) for f, of_one in zip(findings, x, strict=True)]
 
 
@@ -75,14 +82,17 @@ def features(
     foretold: Float[np.ndarray, " findings"],
     explained: bool,
     at_times: Bool[np.ndarray, " findings"],
-) -> Float[np.ndarray, "findings 6"]:
-    r"""What tells how often a weight is right, beside the weight: 1, $\log_{10} s$, $\log_{10} a$, f, u and e.
+    unsure: Float[np.ndarray, "findings dof"],
+) -> Float[np.ndarray, "findings 7"]:
+    r"""What tells how often a weight is right, beside the weight: 1, $\log_{10} s$, $\log_{10} a$, f, u, e and
+    $\log_{10} z$.
 
     Args:
         sizes: torque of each finding at each joint over the held-out error.
         foretold: nats by which each makes torque likelier that nothing was fitted to.
         explained: whether nothing is left unexplained.
         at_times: which are laws that act in an interval only.
+        unsure: deviation of the torque of each, over the same error.
     """
     squares = np.square(sizes)
     at = squares.argmax(1)
@@ -96,6 +106,7 @@ def features(
             np.sign(foretold) * np.log10(1 + np.abs(foretold)),
             np.full(len(sizes), 0.0 if explained else 1.0),
             at_times.astype(float),
+            np.log10(np.clip(sizes[each, at] / np.maximum(unsure[each, at], 1e-300), *_CLEAR)),
         ],
         1,
     )
@@ -106,7 +117,7 @@ def weight_of(posterior: float) -> float:
     return float(scipy.special.logit(np.clip(posterior, 1 - SUREST, SUREST)))
 
 
-def _calibrated(finding: Finding, x: Float[np.ndarray, " 6"]) -> Finding:
+def _calibrated(finding: Finding, x: Float[np.ndarray, " 7"]) -> Finding:
     first, own, *others = WEIGHTS
     sure = float(scipy.special.expit(own * weight_of(finding.confidence) + x @ [first, *others]))
     # what is taken from the finding goes to what nobody thought of; what it gains, the others lose

@@ -222,6 +222,13 @@ def _finding(
         [x[on] for x, on, active in zip(together, acting, problem.active, strict=True) if active]
     )
     rms = np.sqrt(np.mean(felt**2, 0)) if len(felt) else np.zeros(problem.dof)
+    variance = np.zeros(problem.dof)
+    for i, term in zip(members, terms, strict=True):
+        own = slice(0, len(term.deviation))
+        some = zip(term.columns, acting, problem.active, strict=True)
+        columns = np.concatenate([x[on] for x, on, active in some if active])
+        if len(columns):
+            variance += np.einsum("tjn,nm,tjm->j", columns, covariance[i][own, own], columns) / len(columns)
     parameters, equations = [], []
     for i, term in zip(members, terms, strict=True):
         told = term.effect.parameters(coefficients(state, i), covariance[i])
@@ -258,6 +265,7 @@ def _finding(
         kind=getattr(terms[0].effect, "form", ""),
         own_family=effect.family,
         foretold=gained,
+        torque_std=np.sqrt(variance),
     )
 
 

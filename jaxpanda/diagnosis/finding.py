@@ -50,6 +50,8 @@ class Finding:
     none."""
     side: str = ""
     """Of the drives: "link", behind them, or "drive", in them; "" where torque was measured on one side."""
+    torque_std: Float[np.ndarray, " dof"] | None = None
+    """Standard deviation of its torque, by that of its coefficients, rms [N m]; None where it has none."""
     own_family: str = "unknown"
     """Of an effect that `FAMILIES` does not have."""
 
@@ -73,6 +75,7 @@ class Finding:
             "equation": self.equation,
             "parameters": [dict(p) for p in self.parameters],
             "rms_torque": [float(v) for v in self.rms_torque],
+            "rms_torque_std": None if self.torque_std is None else [float(v) for v in self.torque_std],
             "evidence_nats": self.evidence,
             "held_out_nats": self.foretold,
             "summary": self.summary,
