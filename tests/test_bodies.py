@@ -124,6 +124,13 @@ def test_numbers_that_are_not_negative_stay():
     np.testing.assert_array_equal(c, x)
 
 
+def test_a_number_below_zero_by_rounding_is_zero():
+    x = np.array([0.0, -0.1 / SIZES[1] * (1 + 1e-15), 0.0, 0.0, 0.0])
+    c, cost, *_ = at_bounds(x, lambda y: y, NUMBERS)
+    assert cost < 1e-20
+    np.testing.assert_allclose(c, x, atol=1e-12)
+
+
 def test_what_another_law_brings_beside_a_number_at_zero():
     """It was weighed as if the number went on falling: laws that explain next to nothing had evidence of
     thousands of nats, as what a bound leaves of a residual is not orthogonal to the columns of what it holds."""

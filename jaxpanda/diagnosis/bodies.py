@@ -10,8 +10,8 @@ $$\min_c\; \tfrac12 (c - \hat c)^\top C^{-1} (c - \hat c) - \mu \sum_{bodies} \l
 for falling $\mu$ (Boyd and Vandenberghe, Convex Optimization 2004, ch. 11). `feasible.nearest` does the like for
 the links of an arm by their factors; for one body that is slower, and may end where no step helps.
 
-A number of the user's file that laws correct, as a rotor's inertia or a level of friction, is the same with a
-matrix of one entry, $v + \sum_k c_k \ge 0$.
+A number of the user's file, as a rotor's inertia or a level of friction, is not negative with all that laws and
+refits add to it (`at_bounds`).
 """
 
 import dataclasses
@@ -102,9 +102,11 @@ def at_bounds(
     C = A @ wide
     unit = 1 / np.sqrt(np.diag(C))
     root = np.linalg.cholesky(unit[:, None] * C * unit + _ROUNDING * np.eye(len(C)))
-    pull, _ = scipy.optimize.nnls(root.T, scipy.linalg.solve_triangular(root, -found * unit, lower=True))
-    pull *= unit
+    short = scipy.linalg.solve_triangular(root, -found * unit, lower=True)
+    pull = unit * scipy.optimize.nnls(root.T, short, maxiter=100 * len(C))[0]
     zero = np.flatnonzero(pull > 0)
+    if not len(zero):  # below zero by rounding
+        return x, 0.0, solve, []
     at = np.flatnonzero(np.any(A[zero] != 0, 0))
     held, there = A[np.ix_(zero, at)], wide[:, zero]
     factor = scipy.linalg.cho_factor(C[np.ix_(zero, zero)], lower=True)

@@ -244,9 +244,8 @@ def _finding(
         ((n, sure * p) for n, p in rivals[clearest][1].items() if n not in same and sure * p >= _LISTED),
         key=lambda pair: -pair[1],
     )
-    numbers = [one for i in members for one in _corrected(problem, state, i)]
-    said = name, joints, rms, intervals, names, alternatives, problem, own, "; ".join(equations), numbers
-    summary = _summary(*said)
+    equation, numbers = "; ".join(equations), [one for i in members for one in _corrected(problem, state, i)]
+    summary = _summary(name, joints, rms, intervals, names, alternatives, problem, own, equation, numbers)
     if name == CoulombFriction.name and any(isinstance(t.effect, PreslidingHysteresis) for t in terms):
         summary += " Its equation has it stick at rest, as MuJoCo's frictionloss does."
     return Finding(
@@ -256,7 +255,7 @@ def _finding(
         intervals=intervals,
         confidence=float(np.clip(own, 0.0, SUREST)),
         alternatives=tuple(alternatives[:4]),
-        equation="; ".join(equations),
+        equation=equation,
         parameters=tuple(parameters),
         rms_torque=rms,
         evidence=float(sum(rivals[i][0] for i in members)),
