@@ -538,11 +538,11 @@ def _told(
     )
     names = ", ".join(level.trace.name for level in levels)
     when = f"from {span[0]:.2f} to {span[1]:.2f} s " if span else ""
-    others = " or ".join(other.at_rest for p, other in ranked[1:3] if p > 0.1)
+    others = " or ".join(map(_in_words, (other for p, other in ranked[1:3] if p > 0.1)))
     summary = (
         f"In {names} the arm holds still, and {when}torque {'changes' if span else 'is off'} by {shown}"
         + (" (in the first recording)" if len(levels) > 1 else "")
-        + f", beyond what friction at rest can carry: {effect.at_rest}"
+        + f", beyond what friction at rest can carry: {_in_words(effect)}"
         + (f", or {others}." if others else ".")
     )
     return Finding(
@@ -560,6 +560,10 @@ def _told(
         terms=(),
         own_family=effect.family,
     )
+
+
+def _in_words(effect: type[AbstractEffect]) -> str:
+    return effect.at_rest or _plain(effect.name)
 
 
 def _notes(levels: Sequence[Level], arm: Arm, found: bool) -> list[str]:
