@@ -59,9 +59,8 @@ def test_what_acts_for_a_while_only_is_doubted():
 
 def test_torque_that_is_small_beside_what_stays_wrong_elsewhere_is_doubted():
     one = found([1.0, 0.0])
-    unsure = lambda x: dataclasses.replace(
-        one, torque_std=np.array([0.5 * x, 0.0])
-    )  # may have taken in half of it
+    # it may have taken in half of that
+    unsure = lambda x: dataclasses.replace(one, torque_std=np.array([0.5 * x, 0.0]))
     clear, small = (sure([unsure(x)], held_out=np.array([x, 0.2]))[0] for x in (0.1, 1.0))
     assert small < clear - 0.3
 

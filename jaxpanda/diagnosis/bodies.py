@@ -26,6 +26,9 @@ import scipy.optimize
 from jaxpanda_kernels.inertia import pseudo_inertia
 from jaxtyping import Float, Int
 
+from ..arms.arm import Arm
+from ..effects import AbstractEffect
+
 
 @dataclasses.dataclass(frozen=True)
 class Body:
@@ -63,6 +66,16 @@ class Correction:
     """The user's."""
     size: float = 1.0
     """By how much one of the coefficient changes it."""
+
+
+def corrections_of(effect: AbstractEffect, arm: Arm) -> dict[int, Correction]:
+    """Which coefficients of an effect correct a number of the arm."""
+    named = zip(effect.coefficients, effect.corrected(arm), strict=True)
+    return {
+        k: Correction((law.beyond, effect.joints[0]), value)
+        for k, (law, value) in enumerate(named)
+        if law.beyond
+    }
 
 
 @dataclasses.dataclass(frozen=True)

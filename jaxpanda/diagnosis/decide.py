@@ -228,7 +228,7 @@ def _finding(
         some = zip(term.columns, acting, problem.active, strict=True)
         columns = np.concatenate([x[on] for x, on, active in some if active])
         if len(columns):
-            variance += np.einsum("tjn,nm,tjm->j", columns, covariance[i][own, own], columns) / len(columns)
+            variance += np.sum(columns @ covariance[i][own, own] * columns, (0, 2)) / len(columns)
     parameters, equations = [], []
     for i, term in zip(members, terms, strict=True):
         told = term.effect.parameters(coefficients(state, i), covariance[i])

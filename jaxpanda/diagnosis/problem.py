@@ -16,7 +16,7 @@ from .. import signals as signals_
 from ..arms.arm import Arm
 from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect, Channels, Stretches, joint_columns
 from ..errors import InputError
-from .bodies import Body, Correction, body
+from .bodies import Body, Correction, body, corrections_of
 from .discrepancy import at_rest, known_at_rest, of_law, resting, unresolved, unresolved_known
 from .evidence import Columns, Design, Noise
 from .grid import Grid
@@ -49,8 +49,8 @@ class Term:
     """Square of what it may be off for as long as a joint rests, likewise [N² m²]."""
     prior: float = 0.0
     """Logarithm of its prior odds, less what the search over its shapes has cost [nats]."""
-    corrected: tuple[float, ...] = ()
-    """Of each coefficient the number of the user's arm that it corrects; 0 for none."""
+    corrections: Mapping[int, Correction] = dataclasses.field(default_factory=dict)
+    """Which coefficients correct a number of the user's arm."""
 
     @property
     def law(self) -> "Term":
@@ -74,16 +74,6 @@ class Term:
         if self.effect.body is None or len(self.deviation) != len(self.effect.coefficients):
             return None
         return body(self.effect.body)
-
-    @functools.cached_property
-    def corrections(self) -> dict[int, Correction]:
-        """Which coefficients correct a number of the user's arm; none of the tangent of a shape."""
-        laws = self.effect.coefficients
-        if len(self.deviation) != len(laws):
-            return {}
-        each = enumerate(zip(laws, self.corrected, strict=False))
-        named = lambda law: (law.beyond, self.effect.joints[0])
-        return {k: Correction(named(law), value) for k, (law, value) in each if law.beyond}
 
     @property
     def width(self) -> int:
@@ -216,14 +206,15 @@ class Problem:
     ) -> Term:
         """The effect's columns in all recordings; with its discrepancy, if coefficients and noise are known."""
         columns = tuple(self.full_columns(effect))
+        known = corrections_of(effect, self.arm)
         if c is None or std is None:
-            return Term(effect, columns, deviation, prior=prior, corrected=effect.corrected(self.arm))
+            return Term(effect, columns, deviation, prior=prior, corrections=known)
         torque = [x @ c for x in columns]
         evaluate = lambda other: [x @ c for x in self.full_columns(other)]
         off = tuple(of_law(self.traces, effect, torque, std, evaluate))
         traces = self.traces
-        rests, held = at_rest(traces, effect, torque), effect.corrected(self.arm)
-        return Term(effect, columns, deviation, off, unresolved(traces, torque), rests, prior, held)
+        rests = at_rest(traces, effect, torque)
+        return Term(effect, columns, deviation, off, unresolved(traces, torque), rests, prior, known)
 
     def full_columns(self, effect: AbstractEffect) -> list[Float[np.ndarray, "_time dof _n"]]:
         """Columns of an effect, at all joints."""

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from ..arms.arm import Arm
 from ..effects import AbstractJointEffect
 from .alike import TEMPERATURE, joints_with, one_more, shared
 from .credible import fitted
@@ -162,7 +161,7 @@ def choices(
         for form in (p, *plainer(problem, design, noise, p)):
             term = taken(problem, design, noise, form)
             more = problem.design((*terms, term), noise)
-            if is_possible(problem.arm, term, more) and not is_opposed(problem, term, more):
+            if is_possible(term, more) and not is_opposed(problem, term, more):
                 found = evidence(problem, (*terms, term), more, noise)
                 paid = term.prior + shared((*laws, term.effect), problem.telling)
                 out.append((found - own + paid, (term,)))
@@ -176,12 +175,13 @@ def _likeliest(proposals: Sequence[Proposal]) -> list[Proposal]:
     return [p for p in proposals if p.evidence > (_WINDOW * best if best > 0 else UNLIKELY)][:_TRIED]
 
 
-def is_possible(arm: Arm, term: Term, design: Design) -> bool:
+def is_possible(term: Term, design: Design) -> bool:
     """Whether the coefficients of the last term of a design, with the numbers of the arm that they correct, have
     the signs that physics allows, but for noise."""
     first = len(design.precision) - term.width
     signed = [k for k, c in enumerate(term.effect.coefficients) if c.sign]
-    at, held = [first + k for k in signed], np.array(term.effect.corrected(arm))[signed]
+    held = [term.corrections[k].value if k in term.corrections else 0.0 for k in signed]
+    at = [first + k for k in signed]
     unit = np.eye(len(design.precision))[:, at]
     deviation = np.sqrt(np.diag(unit.T @ design.solve(unit)))
     return bool(np.all(design.x[at] + held > -_NEGATIVE * deviation))
