@@ -118,8 +118,8 @@ class Corrected(eqx.Module):
         for effect, c in zip(self.effects, self.coefficients, strict=True):
             if effect.bound_to_recording:
                 continue
-            if hasattr(effect, "standard_change"):
-                link, more = effect.standard_change(c)  # pyright: ignore
+            if (change := effect.standard_change(c)) is not None:
+                link, more = change
                 standard = standard.at[link].add(more)
             for attribute, value in effect.mjcf(c, self.arm).items():
                 if attribute == "gravity":
@@ -178,7 +178,7 @@ class Corrected(eqx.Module):
             if effect.bound_to_recording:
                 here = None if recording is None else effect.placed(recording, later)
             else:
-                native = hasattr(effect, "standard_change") or effect.mjcf(c, self.arm)
+                native = effect.standard_change(c) is not None or effect.mjcf(c, self.arm)
                 here = None if native else effect
             if here is not None:
                 out.append((here, c))

@@ -9,7 +9,7 @@ from helpers import NOISE, record
 
 from jaxpanda import Arm
 from jaxpanda.diagnosis.discrepancy import at_rest, of_known, of_law, unresolved
-from jaxpanda.diagnosis.events import ripple
+from jaxpanda.diagnosis.events import swept
 from jaxpanda.diagnosis.evidence import Design, Noise
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.proposals import grids
@@ -98,7 +98,7 @@ def best(problem, state, name, joint=3):
     library = [g for g in problem.library if (g.name, g.joint) == (name, joint)]
     proposals = [
         *grids(problem, state.design, state.noise, library),
-        *ripple(problem, state.design, state.noise, [joint]),
+        *swept(problem, state.design, state.noise, [joint]),
     ]
     (found,) = (p for p in proposals if p.effect.name == name)
     return found.evidence + found.effect.prior

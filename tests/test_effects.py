@@ -1,6 +1,8 @@
 """The catalogue: every effect keeps the promises that the search, the corrected model and the export rely on."""
 
+import ast
 import dataclasses
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -13,6 +15,7 @@ import scipy.interpolate
 from helpers import to_mujoco
 from jaxpanda_kernels import rnea
 
+import jaxpanda.diagnosis
 from jaxpanda import Arm
 from jaxpanda.corrected import effect_from_json
 from jaxpanda.effects import (
@@ -108,6 +111,18 @@ def columns(effect, motion: Motion, channels: Channels) -> np.ndarray:
         wide[:, effect.joints[0]] = joint_columns([effect], Stretches(channels), motion.dt)[:, 0]
         return wide
     return effect.over(motion)
+
+
+def test_the_diagnosis_names_no_effect():
+    """Nor asks of what class one is. A joint's armature and knowledge that is unknown are words of others too."""
+    classes = {c.__name__ for c in CATALOGUE} | {"AbstractJointEffect", "AbstractArmEffect"}
+    names = {c.name for c in CATALOGUE} - {"armature", "unknown"}
+    for path in sorted(Path(jaxpanda.diagnosis.__file__).parent.glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            said = node.id if isinstance(node, ast.Name) else node.name if isinstance(node, ast.alias) else ""
+            text = node.value if isinstance(node, ast.Constant) else ""
+            assert said not in classes, (path.name, said)
+            assert text not in names, (path.name, text)
 
 
 def test_the_catalogue_holds_the_interface_s_names_and_no_others():
@@ -376,7 +391,7 @@ def test_what_a_simulation_applies_is_what_inverse_dynamics_has(arm, motion, cha
     for effect in shapes(arm):
         if (
             effect.acts_on != "plant"
-            or hasattr(effect, "standard_change")
+            or effect.standard_change(np.zeros(len(effect.coefficients))) is not None
             or effect.name == "gravity_direction"
         ):
             continue  # what MJCF holds natively

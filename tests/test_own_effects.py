@@ -1,5 +1,6 @@
 """Effects of a user's own in a diagnosis, and results that travel by pickle."""
 
+import dataclasses
 import json
 import pickle
 from collections.abc import Sequence
@@ -13,7 +14,19 @@ import pytest
 import jaxpanda
 from jaxpanda import Arm, Corrected, InputError, Recording, diagnose, predict
 from jaxpanda.diagnosis import page
-from jaxpanda.effects import AbstractInstantEffect, Channels, Coefficient
+from jaxpanda.diagnosis.events import windows
+from jaxpanda.diagnosis.premises import pose
+from jaxpanda.diagnosis.state import start
+from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.effects import (
+    AbstractArmEffect,
+    AbstractInstantEffect,
+    Channels,
+    Coefficient,
+    Motion,
+    Shape,
+    catalogue_with,
+)
 
 
 class CoupledDamping(AbstractInstantEffect):
@@ -38,6 +51,48 @@ class CoupledDamping(AbstractInstantEffect):
 
     def at(self, s: Channels):
         return s.qd[self.joint + 1][None]
+
+
+class BrakeLeftOn(AbstractArmEffect):
+    """A brake that drags at a joint for a while: torque in proportion to its velocity from `start` to `stop`."""
+
+    name: ClassVar[str] = "brake_left_on"
+    family: ClassVar[str] = "drive"
+    prior: ClassVar[float] = -17.0
+    shapes: ClassVar[tuple[Shape, ...]] = (
+        Shape("start", "s", -np.inf, np.inf, False),
+        Shape("stop", "s", -np.inf, np.inf, False),
+    )
+    bound_to_recording: ClassVar[bool] = True
+
+    joint: int = eqx.field(static=True)
+    start: float
+    stop: float
+    recording: str = eqx.field(static=True)
+
+    @classmethod
+    def grid(cls, arm: Arm) -> Sequence["BrakeLeftOn"]:
+        return []
+
+    @classmethod
+    def at_some_time(cls, dof: int, recording: str) -> Sequence[Sequence["BrakeLeftOn"]]:
+        return [[cls(joint, -1e9, 1e9, recording)] for joint in range(dof)]
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        return (self.joint,)
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        return (Coefficient("drag", "N·m·s/rad", sign=1, scale=1.0),)
+
+    @property
+    def equation(self) -> str:
+        return "tau = drag * dq while start <= t < stop"
+
+    def over(self, motion: Motion) -> np.ndarray:
+        on = (motion.time >= self.start) & (motion.time < self.stop)
+        return (motion.qd * on[:, None])[:, :, None] * np.eye(motion.dof)[self.joint][:, None]
 
 
 MODEL = """<mujoco><compiler angle="radian"/><worldbody>
@@ -120,6 +175,18 @@ def test_what_was_saved_reads_back_with_the_class_and_says_so_without(found, tmp
 def test_an_effect_that_is_unfinished_or_whose_name_is_taken_is_refused(name, base, said, model):
     with pytest.raises(InputError, match=said):
         diagnose(model, [record(20)], effects=[type("Other", (base,), {"name": name})])
+
+
+def test_the_time_of_an_effect_of_one_s_own_is_searched_for(model):
+    one = record(20, coupling=0.0)
+    on = (one.time >= 3.0) & (one.time < 5.0)
+    tau = one.tau + 0.8 * one.qd * on[:, None] * np.eye(3)[1]
+    trace = prepare(dataclasses.replace(one, tau=tau), Arm.from_mjcf(model))
+    problem = pose((trace,), (True,), "exact", catalogue=catalogue_with([BrakeLeftOn])).problem
+    state = start(problem)
+    likeliest = max(windows(problem, state.design, state.noise), key=lambda p: p.evidence)
+    assert likeliest.key == ("brake_left_on", (1,))
+    assert (likeliest.effect.start, likeliest.effect.stop) == pytest.approx((3.0, 5.0), abs=0.15)
 
 
 def test_an_effect_of_a_recording_must_name_it(model):

@@ -14,7 +14,7 @@ from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose
 from jaxpanda.diagnosis.calibration import calibrated
 from jaxpanda.diagnosis.diagnosis import fit
-from jaxpanda.diagnosis.events import shaking
+from jaxpanda.diagnosis.events import swinging
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.state import start
 from jaxpanda.diagnosis.traces import prepare as prepare_trace
@@ -157,7 +157,7 @@ def test_a_base_that_shakes_is_found_at_its_frequency_and_no_other_is():
     def proposed(one: Recording):
         problem = pose((prepare_trace(one, ARM),), (True,), "exact").problem
         state = start(problem)
-        return shaking(problem, state.design, state.noise)[0]
+        return swinging(problem, state.design, state.noise)[0]
 
     assert proposed(recording()).evidence < 0
     found = proposed(shaken(5.3, 0.2))

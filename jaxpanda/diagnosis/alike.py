@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
-from ..effects import AbstractEffect, AbstractJointEffect
+from ..effects import AbstractEffect
 
 TEMPERATURE = 3.0
 """By which differences of log probability are divided where models are weighed against each other: noise is not
@@ -63,7 +63,7 @@ def _by_law(effects: Iterable[AbstractEffect]) -> dict[str, dict[int, float]]:
     """The prior of each law that joints have alike, at each joint that has it."""
     out: dict[str, dict[int, float]] = defaultdict(dict)
     for effect in effects:
-        if isinstance(effect, AbstractJointEffect):
+        if effect.one_joint:
             joint = effect.joints[0]
             for law, prior in _laws(effect):
                 out[law][joint] = min(prior, out[law].get(joint, 0.0))

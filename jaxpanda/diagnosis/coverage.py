@@ -14,11 +14,8 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from ..effects import AbstractEffect, AbstractJointEffect
-from ..effects.contact import ExternalContact
-from ..effects.drive import TorqueRipple
-from ..effects.load import PayloadChange
-from .events import Proposal, ripple
+from ..effects import AbstractEffect
+from .events import Proposal, swept
 from .evidence import Design, Noise
 from .library import Candidates
 from .problem import Problem
@@ -27,8 +24,6 @@ from .state import State
 
 _PAID = 7.0
 """What a search over shapes, sizes and places costs an effect, about [nats]."""
-_PUSH = 1.0
-"""Length of the contact that the table of exclusion speaks of [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +70,7 @@ class Least:
 
 def heat_map(problem: Problem, state: State) -> HeatMap:
     """The best shape of every effect at every joint, by evidence, and what it gains on held-out blocks."""
-    names = [c.name for c in problem.catalogue]
+    names = list(dict.fromkeys(c.name for c in problem.catalogue))
     groups = [*problem.library, *problem.catchalls]
     second = _best(problem, state.design, state.noise, groups)
     if not state.terms:
@@ -99,7 +94,9 @@ def _best(problem: Problem, design: Design, noise: Noise, groups: Sequence[Candi
     """The likeliest shape of each effect at each place, and where in the groups it stands."""
     best: Best = {}
     places = {id(e): (g, i) for g in groups for i, e in enumerate(g.effects)}
-    for p in (*grids(problem, design, noise, groups), *ripple(problem, design, noise, range(problem.dof))):
+    laws = [c for c in problem.catalogue if not c.free]
+    scanned = swept(problem, design, noise, range(problem.dof), laws)
+    for p in (*grids(problem, design, noise, groups), *scanned):
         if not p.effect.bound_to_recording and (p.key not in best or p.evidence > best[p.key][0].evidence):
             best[p.key] = p, places.get(id(p.effect))
     return best
@@ -125,12 +122,9 @@ def _whitened(
     problem: Problem, noise: Noise, effect: AbstractEffect, place: tuple[Candidates, int] | None
 ) -> dict[int, np.ndarray]:
     """An effect's whitened columns in the joints where it acts."""
-    if isinstance(effect, TorqueRipple) and effect.form == "one":
-        j = effect.joints[0]
-        return {j: problem.whitened([c[:, 0] for c in _waves(problem, [effect])], noise, j)}
     if place is None:
         wide = problem.full_columns(effect)
-    elif isinstance(effect, AbstractJointEffect):
+    elif effect.one_joint:
         group, i = place
         j = effect.joints[0]
         return {j: problem.whitened([c[:, i] for c in group.columns], noise, j)}
@@ -138,15 +132,6 @@ def _whitened(
         wide = [c[:, :, place[1]] for c in place[0].columns]
     felt = [j for j in range(problem.dof) if any(np.any(c[:, j]) for c in wide)]
     return {j: problem.whitened([c[:, j] for c in wide], noise, j) for j in felt}
-
-
-def _waves(problem: Problem, ripples: Sequence[TorqueRipple]) -> list[Float[np.ndarray, "_time m 2"]]:
-    """Columns of ripples at one joint, on the coarse grid."""
-    j, orders = ripples[0].joints[0], np.array([float(e.order) for e in ripples])
-    angles = [
-        t.motion.q[:, j, None] * orders * on for t, on in zip(problem.traces, problem.active, strict=True)
-    ]
-    return [np.stack([np.sin(a), np.cos(a)], 2) for a in angles]
 
 
 def held_out_gains(
@@ -229,15 +214,10 @@ def least_shown(problem: Problem, state: State) -> tuple[Least, ...]:
         if held and held[0][0] < count:
             continue
         rows[key] = found if held and held[0][0] > count else [*held, *found]
-    for effects in _beyond_the_library(problem):
-        ripples = [e for e in effects if isinstance(e, TorqueRipple)]
-        if ripples:
-            columns = _waves(problem, ripples)
-        else:
-            wide = [problem.full_columns(e) for e in effects]
-            columns = [np.stack([w[r] for w in wide], 2) for r in range(len(problem.traces))]
+    acting = {t.name: t.motion for t, on in zip(problem.traces, problem.active, strict=True) if on}
+    for effects in (place for cls in problem.catalogue for place in cls.typical(acting)):
         key = effects[0].name, effects[0].joints[0]
-        rows[key] = [(0, one) for one in _least(problem, state, effects, columns)]
+        rows[key] = [(0, one) for one in _least(problem, state, effects, problem.columns(effects))]
     out = []
     for found in rows.values():
         shown = sorted(
@@ -250,24 +230,6 @@ def least_shown(problem: Problem, state: State) -> tuple[Least, ...]:
     )
 
 
-def _beyond_the_library(problem: Problem) -> list[list[AbstractEffect]]:
-    """Shapes of what is scanned for rather than tabled: ripples, pushes of one second, a load gained half-way."""
-    out: list[list[AbstractEffect]] = []
-    for j in range(problem.dof):
-        travel = max(float(np.ptp(t.motion.q[:, j])) for t in problem.traces)
-        out.append(
-            [TorqueRipple(j, max(n, 3 * np.pi / max(travel, 0.05)), "one") for n in (12.0, 30.0, 60.0)]
-        )
-    trace = next(t for t, on in zip(problem.traces, problem.active, strict=True) if on)
-    first, last = float(trace.motion.time[0]), float(trace.motion.time[-1])
-    starts = np.linspace(first + 1, max(last - 1 - _PUSH, first + 1.1), 5)
-    for link in range(problem.dof):
-        out.append([ExternalContact(link, float(s), float(s) + _PUSH, trace.name, "base") for s in starts])
-    last_link, half = problem.dof - 1, 0.5 * (first + last)
-    out.append([PayloadChange(last_link, half, 1e9, trace.name, "gained")])
-    return [effects for effects in out if type(effects[0]) in problem.catalogue]
-
-
 def _least(
     problem: Problem, state: State, effects: Sequence[AbstractEffect], columns: Sequence[np.ndarray]
 ) -> list[Least]:
@@ -276,7 +238,7 @@ def _least(
     effect = effects[0]
     leading = min(effect.size_of[1], len(effect.coefficients))
     columns = [c[..., :leading] for c in columns]
-    if isinstance(effect, AbstractJointEffect):
+    if effect.one_joint:
         j = effect.joints[0]
         Phi = problem.whitened(columns, noise, j)
         raw = np.einsum("tma,tma->ma", Phi, Phi)

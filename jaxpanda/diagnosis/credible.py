@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractEffect, AbstractJointEffect
+from ..effects import AbstractEffect
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem
@@ -97,7 +97,7 @@ def is_of_time(problem: Problem, design: Design, noise: Noise, proposal: Proposa
     c, _ = fitted(problem, design, noise, proposal)
     noise = dataclasses.replace(noise, slow=None)  # how a repeat differs is all of it, however slow
     told = apart = beyond = 0.0
-    for j in effect.joints if isinstance(effect, AbstractJointEffect) else range(problem.dof):
+    for j in effect.joints if effect.one_joint else range(problem.dof):
         whitened = lambda one, j=j: problem.whitened([x[:, j] for x in problem.full_columns(one)], noise, j)
         law = np.column_stack([np.zeros((problem.rows[-1].stop, 0)), *map(whitened, effect.steady)])
         own = whitened(effect) @ c

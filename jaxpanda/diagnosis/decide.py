@@ -7,11 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.drive import Armature
-from ..effects.friction import CoulombFriction, ViscousFriction
-from ..effects.load import InertialParameters
-from ..effects.memory import PreslidingHysteresis
-from ..effects.sensing import TorqueGain
+from ..effects import UNNAMED, law_of
 from .calibration import SUREST
 from .finding import Finding, joined
 from .problem import Problem, Term
@@ -103,13 +99,14 @@ def numbers(
     torques = [lambda x: regressor @ x.ravel(), *(lambda x, of=of: of * x for of in channels)]
     power = lambda torque: np.mean((torque * weights) ** 2, 0) / np.maximum(np.mean(weights**2, 0), 1e-9)
     told = (
-        (InertialParameters.name, "mass_change", "kg", "Y(q, dq, ddq) * (change of inertial parameters)"),
-        (ViscousFriction.name, "damping", "N·m·s/rad", "damping * dq, beyond the model's"),
-        (CoulombFriction.name, "coulomb", "N·m", "coulomb * sign(dq), beyond the model's"),
-        (Armature.name, "armature", "kg·m²", "armature * ddq, beyond the model's"),
+        ("standard", "mass_change", "kg", "Y(q, dq, ddq) * (change of inertial parameters)"),
+        ("damping", "damping", "N·m·s/rad", "damping * dq, beyond the model's"),
+        ("frictionloss", "coulomb", "N·m", "coulomb * sign(dq), beyond the model's"),
+        ("armature", "armature", "kg·m²", "armature * ddq, beyond the model's"),
     )
     out = []
-    for k, (name, parameter, unit, law) in enumerate(told):
+    for k, (number, parameter, unit, law) in enumerate(told):
+        name = law_of(number).name
         value, std, torque = values[k], deviations[k], torques[k]
         felt = power(torque(value))
         unsure = sum((power(torque(part[k])) for part in moved if np.any(part[k])), np.zeros(problem.dof))
@@ -126,7 +123,7 @@ def numbers(
                 recordings=tuple(t.name for t in suspect),
                 intervals=None,
                 confidence=REFITTED,
-                alternatives=((TorqueGain.name, round(1 - REFITTED, 3)),),
+                alternatives=((law_of("scale").name, round(1 - REFITTED, 3)),),
                 equation=f"tau = {law}",
                 parameters=tuple(
                     {"name": parameter, "joint": j + 1, "value": float(v), "std": float(s), "unit": unit}
@@ -246,8 +243,7 @@ def _finding(
     )
     equation, numbers = "; ".join(equations), [one for i in members for one in _corrected(problem, state, i)]
     summary = _summary(name, joints, rms, intervals, names, alternatives, problem, own, equation, numbers)
-    if name == CoulombFriction.name and any(isinstance(t.effect, PreslidingHysteresis) for t in terms):
-        summary += " Its equation has it stick at rest, as MuJoCo's frictionloss does."
+    summary = " ".join([summary, *dict.fromkeys(t.effect.remark for t in terms if t.effect.remark)])
     return Finding(
         effect=name,
         joints=joints,
@@ -326,12 +322,12 @@ def _summary(name, joints, rms, intervals, recordings, alternatives, problem, ow
     """One or two plain sentences."""
     strongest = int(np.argmax(rms))
     size = f"{rms[strongest]:.3g} {problem.arm.unit('N·m', strongest)} rms"
-    if name == "unknown" and len(joints) > 1:
+    if name == UNNAMED and len(joints) > 1:
         return (
             f"Joints {_listed(joints)} show up to {size}, at joint {strongest + 1}, that no named effect"
             f" explains: {equation.split(': ')[-1]}."
         )
-    if name == "unknown":
+    if name == UNNAMED:
         return (
             f"Joint {strongest + 1} shows {size} that no named effect explains; it is"
             f" fitted as a free curve ({equation.split(': ')[-1]})."

@@ -17,8 +17,7 @@ from ..arms.arm import Arm
 from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
 from ..corrected import KIND, Corrected
-from ..effects import AbstractEffect
-from ..effects.drive import Armature
+from ..effects import UNNAMED, AbstractEffect, law_of
 from ..posterior import FILE as POSTERIOR_FILE
 from ..recordings import Recording
 from ..session import Say
@@ -436,7 +435,7 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
     names = [f.effect for f in found]
     if not names:
         return "consistent"
-    if "unknown" not in names:
+    if UNNAMED not in names:
         doubtful = any(f.confidence < DOUBTFUL and is_large(f, fit) for f in found)
         missed = bool(np.any(fit.held_out_rmse_after > SMALL * fit.noise_floor))
         unsure = missed and all(f.confidence < UNSURE for f in found)
@@ -445,7 +444,7 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
         events_alone = all(f.intervals is not None for f in found)  # no second instance to be tested on
         helps = events_alone or after < before
         return "partly_explained" if partly or doubtful or unsure or not helps else "explained"
-    return "unexplained" if set(names) == {"unknown"} else "partly_explained"
+    return "unexplained" if set(names) == {UNNAMED} else "partly_explained"
 
 
 def _corrected(
@@ -457,7 +456,8 @@ def _corrected(
     x = state.design.x[: problem.nuisance[0].shape[2]] * (1.0 if refitted else 0.0)
     change, damping, level, rotors = premises.changes(x)
     joints = np.flatnonzero(rotors)
-    effects: list[AbstractEffect] = [Armature(int(j), "signed") for j in joints]
+    rotor = law_of("armature")
+    effects: list[AbstractEffect] = [rotor(int(j), "signed") for j in joints]  # pyright: ignore
     values = [jnp.asarray(rotors[j])[None] for j in joints]
     at = len(x) - sum(len(t.deviation) for t in premises.background)
     for term in premises.background if refitted else ():

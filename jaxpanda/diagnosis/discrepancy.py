@@ -17,8 +17,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractEffect, AbstractJointEffect, neighbours
-from ..effects.friction import CoulombFriction
+from ..effects import AbstractEffect, law_of, neighbours
 from .library import turning
 from .noise import hats
 from .traces import Trace
@@ -78,7 +77,7 @@ def of_law(
             off = SHAPE * (np.concatenate(evaluate(other)) - stacked)
             if np.any(size(off) > SEEN):
                 columns.append(off[:, :, None])
-    if effect.dry_width is not None and isinstance(effect, AbstractJointEffect):
+    if effect.dry_width is not None and effect.one_joint:
         j = effect.joints[0]
         level = _level(stacked[:, j])
         if TURN * level > SEEN * std[j]:
@@ -102,7 +101,7 @@ def at_rest(
     traces: Sequence[Trace], effect: AbstractEffect, torque: Torque
 ) -> Float[np.ndarray, "rows dof"] | None:
     """Square of what a law may be off for as long as a joint rests [N² m²]: dry friction, by all of it."""
-    if not (effect.dry and isinstance(effect, AbstractJointEffect)):
+    if not (effect.dry and effect.one_joint):
         return None
     j, rests = effect.joints[0], resting(traces)
     off = np.zeros_like(rests)
@@ -151,7 +150,7 @@ def of_known(
         if KNOWN_TURN * level > SEEN * std[j]:
             sign = np.concatenate([t.down(t.sign[:, j]) for t in traces])
             off.append(KNOWN_TURN * level * (turning(traces, j) - sign[:, None]))
-        law = CoulombFriction
+        law = law_of("frictionloss")
         if law.discrepancy * np.sqrt(np.mean(friction[:, j] ** 2)) > SEEN * std[j]:
             copies = (_hats(traces, j, channel) for channel in law.varies_with)
             off += [law.discrepancy * friction[:, j, None] * copy for copy in copies]

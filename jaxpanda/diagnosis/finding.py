@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import CATALOGUE
+from ..effects import CATALOGUE, UNNAMED
 
 FAMILIES = {**{effect.name: effect.family for effect in CATALOGUE}, "torque_meaning": "meaning"}
 """The family of each effect that a finding may have."""
@@ -52,7 +52,7 @@ class Finding:
     """Of the drives: "link", behind them, or "drive", in them; "" where torque was measured on one side."""
     torque_std: Float[np.ndarray, " dof"] | None = None
     """Standard deviation of its torque, by that of its coefficients, rms [N m]; None where it has none."""
-    own_family: str = "unknown"
+    own_family: str = UNNAMED
     """Of an effect that `FAMILIES` does not have."""
 
     @property

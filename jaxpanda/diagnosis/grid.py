@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..effects import AbstractEffect
-from . import catchall
-from .library import Candidates, build, columns_of
+from ..effects import AbstractEffect, Sweep
+from .library import Candidates, build, columns_of, from_motions
 from .traces import Trace
 
 _MEMORY = 1 << 28
@@ -36,8 +35,36 @@ class Grid:
 
     @functools.cached_property
     def catchalls(self) -> list[Candidates]:
-        """Free forms on these recordings; zero in those of reference."""
-        return self._acting(catchall.build(self.traces))
+        """Shapes that depend on where these recordings have been, likewise."""
+        return self._acting(from_motions(self.traces, self.catalogue))
+
+    def sweep(self, effect: type[AbstractEffect], joint: int) -> Sweep | None:
+        """Shapes of an effect at a joint that are too many for a grid."""
+        key = effect, joint
+        if key not in self._sweeps:
+            self._sweeps[key] = effect.sweep(joint, [t.motion for t in self.traces], self.traces[0].cutoff)
+        return self._sweeps[key]
+
+    @functools.cached_property
+    def _sweeps(self) -> dict[tuple, Sweep | None]:
+        return {}
+
+    def at_some_time(self, r: int) -> list[Sequence[AbstractEffect]]:
+        """What may begin or end within a recording: at each place its forms."""
+        trace = self.traces[r]
+        return [p for c in self.catalogue for p in c.at_some_time(trace.motion.dof, trace.name)]
+
+    @functools.cached_property
+    def _throughout(self) -> dict[int, list[np.ndarray]]:
+        return {}
+
+    def throughout(self, r: int) -> list[np.ndarray]:
+        """Columns of what `at_some_time` has at each place, were it there throughout `(time, dof, n)`."""
+        with self._lock:
+            if r not in self._throughout:
+                motion = self.traces[r].motion
+                self._throughout[r] = [forms[0].over(motion) for forms in self.at_some_time(r)]  # pyright: ignore
+            return self._throughout[r]
 
     def _acting(self, candidates: Sequence[Candidates]) -> list[Candidates]:
         some = lambda columns: zip(columns, self.active, strict=True)

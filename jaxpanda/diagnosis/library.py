@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractArmEffect, AbstractEffect, AbstractJointEffect, joint_columns, turns
+from ..effects import AbstractEffect, joint_columns, turns
 from .host import parallel
 from .traces import Trace
 
@@ -41,17 +41,15 @@ class Candidates:
 
 def columns_of(effects: Sequence[AbstractEffect], trace: Trace) -> Float[np.ndarray, "_time ..."]:
     """Columns of shapes of one class and form: `(time, m, n)` in one joint, `(time, dof, m, n)` in the arm."""
-    local = [e for e in effects if isinstance(e, AbstractJointEffect)]
-    if local:
+    if effects[0].one_joint:
         parts = []
-        for start in range(0, len(local), _BATCH):
-            batch = list(local[start : start + _BATCH])
+        for start in range(0, len(effects), _BATCH):
+            batch = list(effects[start : start + _BATCH])
             filled = batch + [batch[-1]] * (_BATCH - len(batch))
-            fine = joint_columns(filled, trace.stretches, trace.dt)
+            fine = joint_columns(filled, trace.stretches, trace.dt)  # pyright: ignore
             parts.append(trace.down(fine)[:, : len(batch)])
         return np.concatenate(parts, 1)
-    arm = [e for e in effects if isinstance(e, AbstractArmEffect)]
-    return type(arm[0]).over_many(arm, trace.motion)
+    return type(effects[0]).over_many(effects, trace.motion)  # pyright: ignore
 
 
 def turning(traces: Sequence[Trace], joint: int) -> Float[np.ndarray, "rows n"]:
@@ -87,10 +85,32 @@ def _by_joint(effects: Sequence[AbstractEffect], columns: Sequence[np.ndarray]) 
     places: dict[tuple, list[int]] = defaultdict(list)
     for i, effect in enumerate(effects):
         places[effect.joints].append(i)
-    local = isinstance(effects[0], AbstractJointEffect)
     return [
         Candidates(
-            tuple(effects[i] for i in at), joints[0] if local else None, tuple(c[..., at, :] for c in columns)
+            tuple(effects[i] for i in at),
+            joints[0] if effects[0].one_joint else None,
+            tuple(c[..., at, :] for c in columns),
         )
         for joints, at in places.items()
     ]
+
+
+def from_motions(traces: Sequence[Trace], catalogue: Sequence[type[AbstractEffect]]) -> list[Candidates]:
+    """Shapes that depend on where the recordings have been, each by itself."""
+    alike: dict[tuple, list[AbstractEffect]] = defaultdict(list)
+    for effect_class in catalogue:
+        for effect in effect_class.from_motions([t.motion for t in traces]):
+            alike[form_of(effect), len(effect.coefficients)].append(effect)
+
+    def evaluated(same: list[AbstractEffect]) -> list[Candidates]:
+        columns = [columns_of(same, trace) for trace in traces]
+        return [
+            Candidates(
+                (effect,),
+                effect.joints[0] if effect.one_joint else None,
+                tuple(c[..., i : i + 1, :] for c in columns),
+            )
+            for i, effect in enumerate(same)
+        ]
+
+    return [one for group in parallel(evaluated, alike.values()) for one in group]

@@ -20,7 +20,7 @@ import scipy.special
 import scipy.stats
 from jaxtyping import Float
 
-from .events import slowest
+from ..effects import least_order
 from .evidence import Design, Noise
 from .problem import Problem, Term
 from .traces import Trace
@@ -320,7 +320,7 @@ def order_spectrum(
         return np.zeros(0), np.zeros(0), np.zeros(0)
     highest = min(400.0, 2 * np.pi * 0.9 * problem.traces[0].cutoff / speed)
     step = np.pi / (2 * travel)
-    orders = step * np.arange(np.ceil(slowest(travel) / step), highest / step)
+    orders = step * np.arange(np.ceil(least_order(travel) / step), highest / step)
     if len(orders) < 8:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     moving = [

@@ -26,9 +26,9 @@ from jaxtyping import Float
 
 from .. import files
 from ..arms.mjcf import MjcfSource
-from ..effects import AbstractEffect, AbstractJointEffect, Channels, Motion
+from ..effects import UNNAMED, AbstractEffect, Channels, Motion
 from .decide import DOUBTFUL
-from .events import Proposal, ripple
+from .events import Proposal, swept
 from .evidence import Noise
 from .finding import Finding
 from .host import parallel
@@ -252,7 +252,7 @@ def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
         return []
     i = max(finding.terms, key=lambda i: float(np.sum(state.terms[i].columns[0] ** 2)))
     term = state.terms[i]
-    stands_in = finding.effect == "unknown" and term.effect.name != "unknown"
+    stands_in = finding.effect == UNNAMED and term.effect.name != UNNAMED
     if not (rivals or none >= DOUBTFUL) or stands_in or term.effect.bound_to_recording:
         return []
     others = (*state.terms[:i], *state.terms[i + 1 :])
@@ -263,9 +263,11 @@ def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
         return out
     design = problem.design(others, state.noise)
     groups = [g for g in (*problem.library, *problem.catchalls) if g.name in rivals]
-    proposals = [*grids(problem, design, state.noise, groups)]
-    if "torque_ripple" in rivals:
-        proposals += ripple(problem, design, state.noise, term.effect.joints)
+    lawful = [c for c in problem.catalogue if c.name in rivals and not c.free]
+    proposals = [
+        *grids(problem, design, state.noise, groups),
+        *swept(problem, design, state.noise, term.effect.joints, lawful),
+    ]
     best: dict[str, Proposal] = {}
     for p in proposals:
         name = p.effect.name
@@ -357,7 +359,7 @@ def _wide(problem: Problem, shapes: _Shapes, r: int) -> Float[np.ndarray, "_time
         return out
     known = None if trace.tau is None else shapes.columns
     columns = columns_of(shapes.effects, trace) if known is None else known[r]
-    if isinstance(effect, AbstractJointEffect):
+    if effect.one_joint:
         out[:, effect.joints[0]] = columns
         return out
     return columns

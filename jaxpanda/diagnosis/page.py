@@ -153,7 +153,7 @@ def _bars(found: Diagnosis, columns: Mapping[str, Any], names: Sequence[str]) ->
 def _weakest(found: Diagnosis) -> str:
     """For the reader of an empty verdict: what the recordings could show of the commonest effects."""
     parts = []
-    for name in ("coulomb_friction", "viscous_friction", "payload", "torque_offset"):
+    for name in [c.name for c in found.problem.catalogue if c.commonplace]:
         rows = [one for one in found.least_shown if one.effect == name and one.size is not None]
         if rows:
             worst = max(rows, key=lambda one: one.size or 0.0)
@@ -243,8 +243,7 @@ def _pictures(found: Diagnosis, one: Finding, names: Sequence[str]) -> list[Figu
     named = [t.name for t in problem.traces].index(one.recordings[0])
     shown = int(np.argmax([np.sum(v**2) for v in fits])) if one.terms else named
     trace = problem.traces[shown]
-    delayed = one.effect == "time_delay"
-    ordered = one.effect == "torque_ripple"
+    delayed, ordered = against == "lag", against == "order"
     hums = next((p["value"] for p in one.parameters if not one.terms and p["name"] == "frequency"), None)
 
     def regime(canvas: Any) -> None:
@@ -311,7 +310,7 @@ def _regime(found: Diagnosis, effect: AbstractEffect | None, joint: int, against
     traces, unit = found.problem.traces, found.problem.arm.unit
     source = int(getattr(effect, "source", joint))
     what = against.split(",")[0]
-    if what == "time":
+    if what in ("time", "lag"):
         label, x = "time [s]", [t.motion.time for t in traces]
     elif what == "reversal":
         label = f"distance since the last reversal [{unit('rad', joint)}]"
@@ -321,6 +320,7 @@ def _regime(found: Diagnosis, effect: AbstractEffect | None, joint: int, against
         words, turning, at, channel = {
             "velocity": ("velocity of", "rad/s", joint, lambda m: m.qd),
             "position": ("position of", "rad", joint, lambda m: m.q),
+            "order": ("position of", "rad", joint, lambda m: m.q),
             "acceleration": ("acceleration of", "rad/s²", joint, lambda m: m.qdd),
             "load": ("load on", "N·m", joint, lambda m: m.load),
             "|load|": ("size of the load on", "N·m", joint, lambda m: np.abs(m.load)),

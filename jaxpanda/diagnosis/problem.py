@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from .. import signals as signals_
 from ..arms.arm import Arm
-from ..effects import CATALOGUE, AbstractEffect, AbstractJointEffect, Channels, Stretches, joint_columns
+from ..effects import CATALOGUE, AbstractEffect, Channels, Stretches, joint_columns
 from ..errors import InputError
 from .bodies import Body, Correction, body, corrections_of
 from .discrepancy import at_rest, known_at_rest, of_law, resting, unresolved, unresolved_known
@@ -219,7 +219,7 @@ class Problem:
     def full_columns(self, effect: AbstractEffect) -> list[Float[np.ndarray, "_time dof _n"]]:
         """Columns of an effect, at all joints."""
         columns = self.columns([effect])
-        if not isinstance(effect, AbstractJointEffect):
+        if not effect.one_joint:
             return [c[:, :, 0] for c in columns]
         out = []
         for c in columns:
@@ -254,8 +254,10 @@ class Problem:
     def places(self) -> Counter[str]:
         """At how many places each effect is tried."""
         keys = {(g.name, g.effects[0].joints) for g in (*self.library, *self.catchalls)}
-        events = {(name, (j,)) for name in ("torque_ripple", "external_contact") for j in range(self.dof)}
-        return Counter(name for name, _ in {*keys, *events, ("payload_change", ())})
+        events = {(one.name, one.joints) for forms in self.grid.at_some_time(0) for one in forms}
+        joints = range(self.dof)
+        swept = {(c.name, (j,)) for c in self.catalogue for j in joints if self.grid.sweep(c, j)}
+        return Counter(name for name, _ in {*keys, *events, *swept})
 
     @functools.cached_property
     def likeliest_shapes(self) -> dict[tuple, AbstractEffect]:

@@ -6,10 +6,10 @@ from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
-from ..effects import AbstractEffect, AbstractJointEffect
+from ..effects import AbstractEffect
 from .alike import one_more
 from .credible import is_credible
-from .events import Proposal, ripple, shaking, spots, windows
+from .events import Proposal, swept, swinging, windows
 from .evidence import Design, Noise, log_mean_exp
 from .host import parallel
 from .library import Candidates
@@ -43,11 +43,7 @@ def ranked(
     """
     where = range(problem.dof) if joints is None else sorted(joints)
     here = [g for g in (*problem.library, *problem.catchalls) if g.joint is None or g.joint in where]
-    scanned = [
-        *grids(problem, design, noise, here),
-        *spots(problem, design, noise, where),
-        *ripple(problem, design, noise, where),
-    ]
+    scanned = [*grids(problem, design, noise, here), *swept(problem, design, noise, where)]
     beside = one_more([t.effect for t in design.terms], problem.telling)
     kept = [at_others(p, beside) for p in before if is_elsewhere(p.effect, where)]
     events = [p for p in before if p.effect.bound_to_recording]
@@ -55,7 +51,7 @@ def ranked(
     if events and likeliest > _AHEAD * max(0.0, *(p.evidence for p in events)):
         kept += events
     elif len(where) > 1 or joints is None or before:
-        found = (*windows(problem, design, noise), *shaking(problem, design, noise))
+        found = (*windows(problem, design, noise), *swinging(problem, design, noise))
         scanned += [_weighed(problem, design, noise, p) for p in found]
     many = problem.places
     held = Counter(t.effect.name for t in design.terms)
@@ -88,7 +84,7 @@ def by_place(proposals: Sequence[Proposal]) -> dict[int | None, list[Proposal]]:
     """Those of each joint, in their order; under None those that act in several."""
     out: dict[int | None, list[Proposal]] = {}
     for p in proposals:
-        joint = p.effect.joints[0] if isinstance(p.effect, AbstractJointEffect) else None
+        joint = p.effect.joints[0] if p.effect.one_joint else None
         out.setdefault(joint, []).append(p)
     return out
 
@@ -117,7 +113,7 @@ def at_others(proposal: Proposal, beside: Callable[[AbstractEffect], float]) -> 
 
 def is_elsewhere(effect: AbstractEffect, joints: Collection[int]) -> bool:
     """Whether an effect acts in a single joint that is none of these."""
-    return isinstance(effect, AbstractJointEffect) and effect.joints[0] not in joints
+    return effect.one_joint and effect.joints[0] not in joints
 
 
 def grids(problem: Problem, design: Design, noise: Noise, groups: Sequence[Candidates]) -> list[Proposal]:

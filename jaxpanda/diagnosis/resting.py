@@ -37,7 +37,7 @@ from ..arms.arm import Arm
 from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
-from ..effects import CATALOGUE, AbstractEffect, LawAtRest, Levels, Motion, may_carry
+from ..effects import CATALOGUE, UNNAMED, AbstractEffect, LawAtRest, Levels, Motion, may_carry
 from ..errors import InputError
 from ..recordings import Recording
 from ..report import Figure, Section, Table, number
@@ -220,7 +220,7 @@ def judge(
         verdict="consistent"
         if not found
         else "unexplained"
-        if {one.family for one in found} == {"unknown"}
+        if {one.family for one in found} == {UNNAMED}
         else "partly_explained",
         findings=tuple(found),
         fit=Fit(rms, rms, rms, rms, np.maximum(floor, 1e-9)),

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from ..effects import AbstractJointEffect
 from .alike import TEMPERATURE, joints_with, one_more, shared
 from .credible import fitted
 from .events import Proposal
@@ -222,7 +221,7 @@ def foremost(problem: Problem, state: State, proposals: Sequence[Proposal]) -> l
     if not first or first[0][0] < BETTER:
         return []
     term, out = first[0][1][0], list(first)
-    if isinstance(term.effect, AbstractJointEffect):
+    if term.effect.one_joint:
         places = by_place(proposals)
         least = max((p.evidence for p in places.pop(None, [])), default=0.0)
         del places[term.effect.joints[0]]
@@ -319,7 +318,7 @@ def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
         groups = [
             tuple(i for i, t in enumerate(state.terms) if t.effect.joints == (j,)) for j in range(problem.dof)
         ]
-        wide = [i for i, t in enumerate(state.terms) if not isinstance(t.effect, AbstractJointEffect)]
+        wide = [i for i, t in enumerate(state.terms) if not t.effect.one_joint]
         pairs = [p for p in overlaps(state) if set(p) <= set(wide)]
         for group in dict.fromkeys((*(g for g in groups if len(g) > 1), *pairs)):
             step = Step(state, "merge", group)
@@ -350,7 +349,7 @@ def instead(problem: Problem, state: State, i: int, free: bool = True) -> tuple[
     is among them. And whether free forms that were not let in would have been weighed."""
     others = tuple(t for k, t in enumerate(state.terms) if k != i)
     term, rest = state.terms[i], without(state, i)
-    acts = set(term.effect.joints) if isinstance(term.effect, AbstractJointEffect) else {
+    acts = set(term.effect.joints) if term.effect.one_joint else {
         int(j) for j in np.flatnonzero(state.shares[i] > _FELT)
     }  # fmt: skip
     proposals = ranked(problem, rest, state.noise, acts)
@@ -391,7 +390,7 @@ def _parts(
     for part in whole.effect.held:
         terms = (*others, *parts)
         design = problem.design(terms, noise)
-        of_kind = [p for p in ranked(problem, design, noise, joints) if isinstance(p.effect, part)]
+        of_kind = [p for p in ranked(problem, design, noise, joints) if p.effect.name == part.name]
         found = choices(problem, terms, design, noise, _new(terms, of_kind, free))
         if not found:
             return []

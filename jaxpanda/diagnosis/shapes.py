@@ -7,9 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..effects import AbstractEffect, AbstractJointEffect
-from ..effects.contact import ExternalContact
-from ..effects.load import EVER, PayloadChange
+from ..effects import AbstractEffect
 from .events import BIN, Proposal
 from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
 from .library import form_of
@@ -67,7 +65,7 @@ def _score(problem: Problem, design: Design, noise: Noise, effects, columns):
     coefficients = effects[0].coefficients
     signs = np.array(effects[0].signs(problem.arm), float)
     b, G = projection(problem, design, noise, effects, columns)
-    if isinstance(effects[0], AbstractJointEffect):
+    if effects[0].one_joint:
         unit = float(noise.std[effects[0].joints[0]])
         deviation = _deviation(coefficients, np.concatenate(columns), unit)
     else:
@@ -83,7 +81,7 @@ def projection(problem: Problem, design: Design, noise: Noise, effects, columns)
         Phi = problem.whitened(parts, noise, j)
         return Phi, gram(Phi)
 
-    if isinstance(effects[0], AbstractJointEffect):
+    if effects[0].one_joint:
         j = effects[0].joints[0]
         return design.in_joint(j, *prepared(j, columns))
     parts = [prepared(j, [c[:, j] for c in columns]) for j in range(problem.dof)]
@@ -185,18 +183,11 @@ def evidence_of(problem: Problem, design: Design, noise: Noise, effect: Abstract
 
 
 def within(problem: Problem, effect: AbstractEffect) -> AbstractEffect:
-    """A change of payload kept inside its recording: beyond, it is a payload that was there throughout.
-
-    And a contact kept longer than what the filters of motion and torque resolve.
-    """
-    if isinstance(effect, ExternalContact) and effect.stop - effect.start < BIN:
-        middle = 0.5 * (float(effect.start) + float(effect.stop))
-        return dataclasses.replace(effect, start=middle - 0.5 * BIN, stop=middle + 0.5 * BIN)
-    if not isinstance(effect, PayloadChange):
+    """An effect as its recording can tell it."""
+    if not effect.is_event:
         return effect
-    time = clock(problem, effect.recording)
-    inside = lambda at: at if abs(at) >= EVER else float(np.clip(at, time[0] + 3 * BIN, time[-1] - 3 * BIN))
-    return dataclasses.replace(effect, start=inside(float(effect.start)), stop=inside(float(effect.stop)))
+    time = clock(problem, effect.recordings[0])
+    return effect.within(float(time[0]), float(time[-1]), BIN)
 
 
 def moved(effect: AbstractEffect, move: Float[np.ndarray, " shapes"]) -> AbstractEffect:

@@ -36,8 +36,6 @@ from .diagnosis import Diagnosis
 from .finding import VERDICTS, Finding, Fit
 from .posterior import posterior_of_sides
 
-BEHIND = frozenset({"load", "contact"})
-"""Families of what acts on the links, behind every drive."""
 DRIVE = "drive"
 """The family whose physics is in the drive, wherever its torque is seen."""
 
@@ -169,7 +167,7 @@ def drive_alone(arm: Arm) -> Arm:
 
 def on_drives(catalogue: Sequence[type[AbstractEffect]]) -> tuple[type[AbstractEffect], ...]:
     """Effects that can act between the torque of the motors and that behind the drives."""
-    return tuple(e for e in catalogue if e.family not in BEHIND and e.acts_on != "position")
+    return tuple(e for e in catalogue if not e.on_links and e.acts_on != "position")
 
 
 def on_motors(found: Diagnosis, recordings: Sequence[Recording]) -> list[Recording]:

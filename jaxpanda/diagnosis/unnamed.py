@@ -17,7 +17,7 @@ import scipy.ndimage
 from jaxtyping import Float
 from scipy.signal.windows import hann
 
-from ..effects import may_carry
+from ..effects import UNNAMED, may_carry
 from ..signals import Signals, white_noise
 from .calibration import SUREST
 from .finding import Finding, joined
@@ -106,7 +106,7 @@ def _standing_off(
     rms[joint] = np.sqrt(np.mean(np.concatenate([e[:, joint] for e, _, _ in suspect]) ** 2))
     samples = sum(np.count_nonzero(count[:, joint]) for _, _, count in suspect)
     return Finding(
-        effect="unknown",
+        effect=UNNAMED,
         joints=(joint,),
         recordings=(trace.name,),
         intervals=None if whole else when,
@@ -156,7 +156,7 @@ def held_off(problem: Problem, state: State) -> Finding | None:
     clearest = max(seen, key=lambda joint: seen[joint][0])
     times, trace, off = seen[clearest]
     return Finding(
-        effect="unknown",
+        effect=UNNAMED,
         joints=tuple(sorted(seen)),
         recordings=tuple(dict.fromkeys(trace.name for _, trace, _ in seen.values())),
         intervals=None,
@@ -190,7 +190,7 @@ def stuck(problem: Problem, std: Float[np.ndarray, " dof"]) -> Finding | None:
         error[inside, joint] = trace.residual[inside, joint]
     rms = np.sqrt((error**2).sum(0) / np.maximum((error != 0).sum(0), 1))
     return Finding(
-        effect="unknown",
+        effect=UNNAMED,
         joints=joints,
         recordings=(trace.name,),
         intervals=when,
@@ -240,7 +240,7 @@ def hum(
     told = [("frequency", None, clearest.frequency, clearest.spread, "Hz")]
     told += [("amplitude", j + 1, line.amplitude, line.deviation, "N·m") for j, line in loudest.items()]
     return Finding(
-        effect="unknown",
+        effect=UNNAMED,
         joints=tuple(loudest),
         recordings=tuple(one.name for one, lines in same if lines),
         intervals=None,

@@ -68,7 +68,8 @@ def corrected_document(
         return source.document, ()
     corrected, warnings = with_nearest(corrected, problem)
     native = corrected.native
-    moved = moved or any(hasattr(e, "standard_change") for e in corrected.effects)
+    held = zip(corrected.effects, corrected.coefficients, strict=True)
+    moved = moved or any(e.standard_change(c) is not None for e, c in held)
     values = tuple(
         jnp.maximum(getattr(native, n), 0.0) if n in _NOT_NEGATIVE else getattr(native, n) for n in KNOWN
     )

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 from ..errors import InputError
 from . import contact, drive, friction, load, memory, sensing, stribeck, unknown
+from .drive import least_order as least_order
+from .effect import UNNAMED as UNNAMED
 from .effect import AbstractArmEffect as AbstractArmEffect
 from .effect import AbstractEffect as AbstractEffect
 from .effect import AbstractInstantEffect as AbstractInstantEffect
@@ -14,6 +16,7 @@ from .effect import AbstractMemoryEffect as AbstractMemoryEffect
 from .effect import Coefficient as Coefficient
 from .effect import Shape as Shape
 from .effect import Stretches as Stretches
+from .effect import Sweep as Sweep
 from .effect import joint_columns as joint_columns
 from .effect import neighbours as neighbours
 from .effect import sign_over_velocity as sign_over_velocity
@@ -38,6 +41,11 @@ CATALOGUE: tuple[type[AbstractEffect], ...] = (
     *contact.EFFECTS,
     *unknown.EFFECTS,
 )
+
+
+def law_of(number: str) -> type[AbstractEffect]:
+    """The effect that says that a number of the user's model is wrong, by `AbstractEffect.number`."""
+    return next(effect for effect in CATALOGUE if effect.number == number)
 
 
 def catalogue_with(effects: Sequence[type[AbstractEffect]]) -> tuple[type[AbstractEffect], ...]:

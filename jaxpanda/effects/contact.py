@@ -1,7 +1,7 @@
 """Forces from outside."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -12,7 +12,7 @@ from jaxpanda_kernels import link_poses
 from jaxtyping import Array, Float
 
 from ..arms.arm import Arm
-from .effect import AbstractArmEffect, Coefficient, Resistance, Shape
+from .effect import EVER, AbstractArmEffect, Coefficient, Resistance, Shape
 from .load import body_at_rest, window
 from .motion import Motion, wrench_columns
 from .still import LawAtRest, Levels
@@ -21,6 +21,8 @@ _FORCE, _MOMENT = 30.0, 5.0
 """Deviations of a force from outside [N] and of its moment [N m] on an arm that holds still."""
 _LEANS = 0.2
 """Share of such forces that point straight down, or up, as a weight does."""
+_PUSH, _PUSHES = 1.0, 5
+"""Length of the contact whose smallest size is told [s], and at how many times of a recording it is tried."""
 
 
 class ExternalContact(AbstractArmEffect):
@@ -47,6 +49,7 @@ class ExternalContact(AbstractArmEffect):
     size_of: ClassVar[tuple[str, int]] = ("force", 3)
     repeats: ClassVar[bool] = True
     at_rest: ClassVar[str] = "a force from outside"
+    on_links: ClassVar[bool] = True
 
     link: int = eqx.field(static=True)
     start: Float[Array, ""] | float
@@ -57,7 +60,18 @@ class ExternalContact(AbstractArmEffect):
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["ExternalContact"]:
-        return []  # the event scan proposes them
+        return []
+
+    @classmethod
+    def at_some_time(cls, dof: int, recording: str) -> Sequence[Sequence["ExternalContact"]]:
+        return [[cls(link, -EVER, EVER, recording, "base")] for link in range(dof)]
+
+    @classmethod
+    def typical(cls, recordings: Mapping[str, Motion]) -> Sequence[Sequence["ExternalContact"]]:
+        name, motion = next(iter(recordings.items()))
+        first, last = float(motion.time[0]) + 1, float(motion.time[-1]) - 1
+        starts = [float(s) for s in np.linspace(first, max(last - _PUSH, first + 0.1), _PUSHES)]
+        return [[cls(link, s, s + _PUSH, name, "base") for s in starts] for link in range(motion.dof)]
 
     @classmethod
     def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
@@ -97,6 +111,13 @@ class ExternalContact(AbstractArmEffect):
 
     def placed(self, recording: str, later: bool | None) -> "ExternalContact | None":
         return self if recording == self.recording else None
+
+    def within(self, first: float, last: float, step: float) -> "ExternalContact":
+        """Kept as long as what the filters of motion and torque resolve."""
+        if self.stop - self.start >= step:
+            return self
+        middle = 0.5 * (float(self.start) + float(self.stop))
+        return dataclasses.replace(self, start=middle - 0.5 * step, stop=middle + 0.5 * step)
 
     @property
     def joints(self) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from jaxpanda_kernels import mass_matrix
 from jaxtyping import Array, Float
 
 from ..arms.arm import Arm
-from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Numbers, Shape
+from .effect import AbstractArmEffect, AbstractInstantEffect, Coefficient, Numbers, Shape, Sweep
 from .friction import CORRECTED
 from .motion import Channels, Joint, Motion
 from .twist import Law, held_up, low_passed, twist_torque
@@ -30,6 +30,7 @@ class Armature(AbstractInstantEffect):
     alike: ClassVar[bool] = True
     seen_against: ClassVar[str] = "acceleration"
     reveals: ClassVar[str] = "high accelerations in several poses of the joints beyond"
+    number: ClassVar[str] = "armature"
 
     joint: Joint
     form: str = eqx.field(static=True, default="")
@@ -82,6 +83,7 @@ class JointSpring(AbstractInstantEffect):
     seen_against: ClassVar[str] = "position"
     prior: ClassVar[float] = -17.0
     reveals: ClassVar[str] = "the joint's full range at rest, in different poses of the arm"
+    on_links: ClassVar[bool] = True
 
     joint: Joint
     form: str = eqx.field(static=True)
@@ -178,13 +180,26 @@ class JointSpring(AbstractInstantEffect):
         return {"stiffness": {j: c[0]}, "springref": {j: rest}}
 
 
+_SLOWEST, _HIGHEST = 5.0, 400.0
+"""Least and highest order of a ripple that is searched for [1/rad]."""
+_TURNS, _MOVES = 0.1, 0.02
+"""Least travel [rad] and speed [rad/s] of a joint whose ripple is."""
+_TYPICAL = (12.0, 30.0, 60.0)
+"""Orders that the smallest ripple is told of which recordings show [1/rad]."""
+
+
+def least_order(travel: float) -> float:
+    """The least order of which a travel [rad] shows a period and a half, lest it be a spring [1/rad]."""
+    return max(_SLOWEST, 3 * np.pi / travel)
+
+
 class TorqueRipple(AbstractInstantEffect):
     r"""Torque periodic in the position of the joint or of its motor.
 
     $$\tau_j = a \sin(n q_j) + b \cos(n q_j)$$
 
     The order n is per turn of the joint: 2N for the wave generator of a gear of ratio N; the second harmonic is
-    in form "two". `grid` holds no order: the search scans them.
+    in form "two". `grid` holds no order: `sweep` does.
 
     References:
         Tuttle, MIT AI-TR 1365, 1992; Taghirad, Bélanger, Helmy 1998.
@@ -192,7 +207,7 @@ class TorqueRipple(AbstractInstantEffect):
 
     name: ClassVar[str] = "torque_ripple"
     family: ClassVar[str] = "drive"
-    seen_against: ClassVar[str] = "position"
+    seen_against: ClassVar[str] = "order"
     repeats: ClassVar[bool] = True
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("order", "1/rad", 2.5, 600.0),)
     reveals: ClassVar[str] = "a sweep of speeds: the frequency moves with it, the order stays"
@@ -204,6 +219,34 @@ class TorqueRipple(AbstractInstantEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["TorqueRipple"]:
         return []
+
+    @classmethod
+    def sweep(cls, joint: int, motions: Sequence[Motion], cutoff: float) -> Sweep | None:
+        travel = max(np.ptp(m.q[:, joint]) for m in motions)
+        speed = np.sqrt(np.mean(np.concatenate([m.qd[:, joint] for m in motions]) ** 2))
+        if travel < _TURNS or speed < _MOVES:
+            return None
+        step = np.pi / (2 * travel)
+        orders = np.arange(least_order(travel), min(_HIGHEST, 2 * np.pi * 0.9 * cutoff / speed), step)
+        if not len(orders):
+            return None
+
+        def columns(motion: Motion) -> Float[np.ndarray, "time shapes 2"]:
+            angle = motion.q[:, joint, None] * orders
+            return np.stack([np.sin(angle), np.cos(angle)], 2)
+
+        shape = lambda i: cls(joint, float(orders[i]), "one")
+        return Sweep(columns, shape, lambda i: (0.4 * step / orders[i],))
+
+    @classmethod
+    def typical(cls, recordings: Mapping[str, Motion]) -> Sequence[Sequence["TorqueRipple"]]:
+        motions = list(recordings.values())
+        out = []
+        for joint in range(motions[0].dof):
+            travel = max(float(np.ptp(m.q[:, joint])) for m in motions)
+            least = 3 * np.pi / max(travel, 0.05)
+            out.append([cls(joint, max(order, least), "one") for order in _TYPICAL])
+        return out
 
     def variants(self, arm: Arm) -> Sequence["TorqueRipple"]:
         return [dataclasses.replace(self, form="two")] if self.form == "one" else []

@@ -12,7 +12,7 @@ Stribeck friction with and without the Coulomb level that the model already hold
 import abc
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
@@ -75,6 +75,10 @@ class Resistance(eqx.Module):
 
 COMMON = -9.0
 """Prior of what nearly every arm has: friction of its gears, offsets of its torque sensors."""
+UNNAMED = "unknown"
+"""Name, in the interface, of what has no law."""
+EVER = 1e9
+"""Seconds that no recording reaches."""
 
 
 class AbstractEffect(eqx.Module):
@@ -126,11 +130,61 @@ class AbstractEffect(eqx.Module):
     """Whether that size is told of the component that shows least, not of the middle one."""
     at_rest: ClassVar[str] = ""
     """What it is, as a sentence about an arm that holds still has it; of those that `while_still` tells of."""
+    commonplace: ClassVar[bool] = False
+    """Whether anybody would ask for it first: where nothing is found, how much of it could be there is told."""
+    one_joint: ClassVar[bool] = False
+    """Whether it acts in the torque of one joint, by columns in time alone."""
+    swings: ClassVar[bool] = False
+    """Whether it swings at one frequency throughout recordings."""
+    on_links: ClassVar[bool] = False
+    """Whether it acts on the links, behind every drive."""
+    number: ClassVar[str] = ""
+    """The number that is wrong where it is found: "damping", "frictionloss" or "armature" of a joint of the
+    user's model, its links' "standard" parameters, or the "scale" of a torque sensor."""
 
     @classmethod
     @abc.abstractmethod
     def grid(cls, arm: Arm) -> Sequence["AbstractEffect"]:
         """Shapes and forms to try, for every joint or link it may act at."""
+
+    @classmethod
+    def from_motions(cls, motions: Sequence[Motion]) -> Sequence["AbstractEffect"]:
+        """Shapes and forms to try that depend on where recordings have been."""
+        return ()
+
+    @classmethod
+    def sweep(cls, joint: int, motions: Sequence[Motion], cutoff: float) -> "Sweep | None":
+        """Shapes to try that are too many for a grid; None where the motions show none at this joint.
+
+        Args:
+            joint: where.
+            motions: in all recordings.
+            cutoff: up to which torque is compared [Hz].
+        """
+        return None
+
+    @classmethod
+    def at_some_time(cls, dof: int, recording: str) -> Sequence[Sequence["AbstractEffect"]]:
+        """Of what begins or ends within a recording, at each place its forms, there throughout and with the same
+        columns: when it acts is searched for. `placed_between` makes one that acts for a while."""
+        return ()
+
+    @classmethod
+    def swinging(cls, dof: int, recordings: tuple[str, ...], frequency: float) -> "AbstractEffect":
+        """Of what `swings`, that with this frequency [Hz], which is searched for. Of each recording in turn its
+        coefficients are those of `swung` times a sine, then a cosine."""
+        raise NotImplementedError(f"{cls.name} does not swing")
+
+    @classmethod
+    def swung(cls, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        """What such an effect multiplies by its sine and its cosine."""
+        raise NotImplementedError(f"{cls.name} does not swing")
+
+    @classmethod
+    def typical(cls, recordings: Mapping[str, Motion]) -> Sequence[Sequence["AbstractEffect"]]:
+        """Of an effect that `grid` has no shapes of, those of each place that the smallest size is told of which
+        recordings show; `recordings` by their names."""
+        return ()
 
     @classmethod
     def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
@@ -161,6 +215,21 @@ class AbstractEffect(eqx.Module):
     def recordings(self) -> tuple[str, ...]:
         """Names of those it is bound to."""
         return (self.recording,) if self.bound_to_recording else ()  # pyright: ignore
+
+    @property
+    def ends(self) -> tuple[bool, bool]:
+        """Of `at_some_time`: whether this form begins, and whether it ends, within its recording."""
+        return True, True
+
+    def placed_between(self, start: float, stop: float) -> "AbstractEffect":
+        """The same from `start` to `stop` [s], those of its `ends` that are within its recording."""
+        begins, ceases = self.ends
+        times = start if begins else -EVER, stop if ceases else EVER
+        return dataclasses.replace(self, start=times[0], stop=times[1])  # pyright: ignore
+
+    def within(self, first: float, last: float, step: float) -> "AbstractEffect":
+        """The same, as a recording from `first` to `last` can tell it that resolves times of `step` [s]."""
+        return self
 
     @property
     def passes(self) -> bool:
@@ -257,9 +326,18 @@ class AbstractEffect(eqx.Module):
             )
         return out
 
+    @property
+    def remark(self) -> str:
+        """A sentence that a finding of it needs beside its equation."""
+        return ""
+
     def unit(self, turning: str, arm: Arm) -> str:
         """Unit of one of its numbers; of those in a joint's coordinate, by whether the joint slides."""
         return arm.unit(turning, self.joints[0]) if hasattr(self, "joint") else turning
+
+    def standard_change(self, c: Numbers) -> tuple[int, Float[Array, "10"] | Float[np.ndarray, "10"]] | None:
+        """Link, and what is added to its standard parameters, of a law that adds that throughout and no more."""
+        return None
 
     def mjcf(self, c: Numbers, arm: Arm) -> Mapping[str, Any]:
         """Changes that reproduce the effect in MuJoCo natively, by joint attribute; empty if none can."""
@@ -332,6 +410,17 @@ class AbstractEffect(eqx.Module):
         return {"class": type(self).__name__, **fields}
 
 
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """Very many shapes of an effect at one joint, evaluated together."""
+
+    columns: Callable[[Motion], Float[np.ndarray, "time shapes n"]]
+    shape: Callable[[int], AbstractEffect]
+    """The effect with one of the shapes."""
+    steps: Callable[[int], tuple[float, ...]]
+    """First steps of a refinement from there, one a shape parameter."""
+
+
 def _plain(value: Any) -> Any:
     if isinstance(value, str | tuple | list | int | float) or value is None:
         return value
@@ -344,6 +433,8 @@ Seconds = Float[Array, ""] | float
 
 class AbstractJointEffect(AbstractEffect):
     """An effect in the torque of one joint, that depends on channels at one instant or on their past."""
+
+    one_joint: ClassVar[bool] = True
 
     joint: Any
 

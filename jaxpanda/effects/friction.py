@@ -57,6 +57,8 @@ class ViscousFriction(AbstractInstantEffect):
     seen_against: ClassVar[str] = "velocity"
     reveals: ClassVar[str] = "runs at four or more constant speeds, in both directions"
     prior: ClassVar[float] = COMMON
+    number: ClassVar[str] = SLOPE.beyond
+    commonplace: ClassVar[bool] = True
 
     joint: Joint
     form: str = eqx.field(static=True, default="")
@@ -97,6 +99,8 @@ class CoulombFriction(AbstractDryFriction):
     reveals: ClassVar[str] = "reversals, with dwells between them"
     at_rest: ClassVar[str] = "friction that the model does not have, and that carries a load at rest"
     prior: ClassVar[float] = COMMON
+    number: ClassVar[str] = LEVEL.beyond
+    commonplace: ClassVar[bool] = True
 
     joint: Joint
     v0: Float[Array, ""] | float

@@ -11,7 +11,7 @@ from jaxpanda_kernels import rnea
 from jaxtyping import Array, Float
 
 from ..arms.arm import Arm
-from .effect import AbstractArmEffect, Coefficient, Numbers, Resistance, Shape
+from .effect import EVER, AbstractArmEffect, Coefficient, Numbers, Resistance, Shape
 from .motion import Motion
 from .still import LawAtRest, Levels
 
@@ -90,6 +90,8 @@ class InertialParameters(AbstractArmEffect):
     seen_against: ClassVar[str] = "model torque"
     reveals: ClassVar[str] = "an identification motion; a reference recording from before"
     at_rest: ClassVar[str] = "links that differ from the model's"
+    on_links: ClassVar[bool] = True
+    number: ClassVar[str] = "standard"
 
     link: int = eqx.field(static=True)
     standard: tuple[float, ...] = eqx.field(static=True)
@@ -148,6 +150,8 @@ class Payload(AbstractArmEffect):
     seen_against: ClassVar[str] = "model torque"
     reveals: ClassVar[str] = "a recording without the load, of the same motion"
     at_rest: ClassVar[str] = "a body at the flange that the model does not have"
+    commonplace: ClassVar[bool] = True
+    on_links: ClassVar[bool] = True
 
     link: int = eqx.field(static=True)
 
@@ -202,6 +206,7 @@ class PayloadChange(AbstractArmEffect):
     prior: ClassVar[float] = -17.0
     reveals: ClassVar[str] = "the same poses before and after"
     at_rest: ClassVar[str] = "a body gained or lost at the flange"
+    on_links: ClassVar[bool] = True
     bound_to_recording: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
 
@@ -223,7 +228,27 @@ class PayloadChange(AbstractArmEffect):
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["PayloadChange"]:
-        return []  # the event scan proposes them
+        return []
+
+    @classmethod
+    def at_some_time(cls, dof: int, recording: str) -> Sequence[Sequence["PayloadChange"]]:
+        return [[cls(dof - 1, -EVER, EVER, recording, form) for form in ("gained", "lost", "carried")]]
+
+    @classmethod
+    def typical(cls, recordings: Mapping[str, Motion]) -> Sequence[Sequence["PayloadChange"]]:
+        """Gained half-way."""
+        name, motion = next(iter(recordings.items()))
+        middle = 0.5 * float(motion.time[0] + motion.time[-1])
+        return [[cls(motion.dof - 1, middle, EVER, name, "gained")]]
+
+    @property
+    def ends(self) -> tuple[bool, bool]:
+        return self.form != "lost", self.form != "gained"
+
+    def within(self, first: float, last: float, step: float) -> "PayloadChange":
+        """Kept inside the recording: beyond, it is a payload that was there throughout."""
+        inside = lambda at: at if abs(at) >= EVER else float(np.clip(at, first + 3 * step, last - 3 * step))
+        return dataclasses.replace(self, start=inside(float(self.start)), stop=inside(float(self.stop)))
 
     @classmethod
     def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
@@ -290,10 +315,6 @@ class PayloadChange(AbstractArmEffect):
         return _as_body(self, self._basis[0], c, covariance) + when
 
 
-EVER = 1e9
-"""Seconds that no recording reaches."""
-
-
 class GravityDirection(AbstractArmEffect):
     r"""A base that is not level, or a wrong gravity vector.
 
@@ -309,6 +330,7 @@ class GravityDirection(AbstractArmEffect):
     weakest_counts: ClassVar[bool] = True
     reveals: ClassVar[str] = "the first joint turned over 180 degrees"
     at_rest: ClassVar[str] = "a base that is not level"
+    on_links: ClassVar[bool] = True
 
     across: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     dof: int = eqx.field(static=True)

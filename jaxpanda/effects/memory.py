@@ -96,6 +96,12 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         return CoulombFriction.name if self.sticks and self._extent != "extra" else self.name
 
     @property
+    def remark(self) -> str:
+        if self.title == self.name:
+            return ""
+        return "Its equation has it stick at rest, as MuJoCo's frictionloss does."
+
+    @property
     def form_prior(self) -> float:
         """Dry friction that sticks is Coulomb's, and as likely beforehand."""
         if self.sticks and self._extent == "only":

@@ -26,6 +26,7 @@ class TorqueOffset(AbstractInstantEffect):
     reveals: ClassVar[str] = "rests, and poses on both sides of the joint's zero of gravity"
     at_rest: ClassVar[str] = "a bias of the torque sensors"
     prior: ClassVar[float] = COMMON
+    commonplace: ClassVar[bool] = True
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
@@ -68,6 +69,7 @@ class TorqueGain(AbstractInstantEffect):
     family: ClassVar[str] = "sensor"
     seen_against: ClassVar[str] = "model torque"
     reveals: ClassVar[str] = "a known load at the flange"
+    number: ClassVar[str] = "scale"
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 
     joint: Joint
@@ -289,6 +291,7 @@ class TimeDelay(AbstractArmEffect):
     family: ClassVar[str] = "clock"
     prior: ClassVar[float] = -27.0
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("around", "s", 1e-4, 0.2, pivot=True),)
+    seen_against: ClassVar[str] = "lag"
     reveals: ClassVar[str] = "fast reversals"
     acts_on: ClassVar[Literal["plant", "position", "torque"]] = "torque"
 

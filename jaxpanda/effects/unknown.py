@@ -1,6 +1,7 @@
 """What no named effect explains: a free function of a channel or two, so that it is still located and fitted."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
@@ -12,12 +13,14 @@ from jaxtyping import Array, Float
 
 from ..arms.arm import Arm
 from .effect import (
+    UNNAMED,
     AbstractArmEffect,
     AbstractDryFriction,
     AbstractInstantEffect,
     Coefficient,
     Resistance,
     Shape,
+    Sweep,
     sign_over_velocity,
     smooth_sign,
 )
@@ -56,6 +59,51 @@ _AGAINST = {
     "odd in dq_k": "source velocity",
 }
 """`seen_against` of each."""
+_CHANNELS = {
+    "odd in dq": lambda m, j: np.abs(m.qd[:, j]),
+    "even in dq": lambda m, j: np.abs(m.qd[:, j]),
+    "of q": lambda m, j: m.q[:, j],
+    "of load": lambda m, j: m.load[:, j],
+    "friction of q": lambda m, j: m.q[:, j],
+    "friction of load": lambda m, j: np.abs(m.load[:, j]),
+    "of ddq": lambda m, j: m.qdd[:, j],
+    "of q_k": lambda m, j: m.q[:, j],
+    "odd in dq_k": lambda m, j: np.abs(m.qd[:, j]),
+}
+"""What each is a function of, over a motion."""
+_KNOTS, _FEW = {"odd in dq": 8, "even in dq": 8, "of q": 10, "friction of q": 9}, 6
+"""How many knots each has, and the others."""
+_VARIES = 1e-6
+"""Range from which a channel can tell a function of it."""
+_MOVES = 0.02
+"""Travel from which a joint's position may count beside another's [rad]."""
+_SLOW = 1e-3
+"""What a product of two joints' velocities [rad²/s²], and the last link's [m/s], must exceed to tell anything."""
+_OF_FASTEST, _REACHES = (0.15, 0.4, 0.7, 1.0), (0.0, 0.1, 0.2)
+"""Knots of a drag, in the largest speed of the last link, and where beyond its frame it may act [m]."""
+_LIMITS = np.geomspace(0.1, 0.98, 16)
+"""Of a torque sensor, in the largest torque of its joint."""
+_SPOTS, _PLACES = (0.03, 0.08), 64
+"""Widths of a torque at one place [rad], and how many places are tried at most."""
+
+
+def _ranges(motions: Sequence[Motion]) -> Float[np.ndarray, "2 dof"]:
+    """Where the joints have been, but for the extremes [rad]."""
+    return np.quantile(np.concatenate([m.q for m in motions]), _NEARLY_ALL, axis=0)
+
+
+_NEARLY_ALL = (0.005, 0.995)
+"""Quantiles of a channel between which a function of it is told."""
+
+
+def _knots(form: str, x: Float[np.ndarray, " time"]) -> tuple[float, ...]:
+    """Half by the range, half by where the samples are; none where the channel hardly varies."""
+    share = np.linspace(0, 1, _KNOTS.get(form, _FEW))
+    low, high = np.quantile(x, _NEARLY_ALL)
+    if high - low < _VARIES:
+        return ()
+    evenly = low + share * (high - low)
+    return tuple((0.5 * evenly + 0.5 * np.quantile(x, 0.005 + 0.99 * share)).tolist())
 
 
 class Unknown(AbstractInstantEffect):
@@ -65,7 +113,7 @@ class Unknown(AbstractInstantEffect):
     constant. `source` is the joint whose channel x is.
     """
 
-    name: ClassVar[str] = "unknown"
+    name: ClassVar[str] = UNNAMED
     prior: ClassVar[float] = FREE
     free: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
@@ -83,7 +131,17 @@ class Unknown(AbstractInstantEffect):
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["Unknown"]:
-        return []  # its knots depend on the recordings
+        return []
+
+    @classmethod
+    def from_motions(cls, motions: Sequence[Motion]) -> Sequence["Unknown"]:
+        joints, out = range(motions[0].dof), []
+        for form, j in itertools.product(FORMS, joints):
+            others = form.endswith("_k")
+            for k in [k for k in joints if (k != j) == others]:
+                if knots := _knots(form, np.concatenate([_CHANNELS[form](m, k) for m in motions])):
+                    out.append(cls(j, k, knots, form))
+        return out
 
     @classmethod
     def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
@@ -173,7 +231,7 @@ class UnknownOfTwo(AbstractInstantEffect):
     and constant beyond; P are Legendre's polynomials. A cable or a hose led past both joints gives such a torque.
     """
 
-    name: ClassVar[str] = "unknown"
+    name: ClassVar[str] = UNNAMED
     seen_against: ClassVar[str] = "position"
     prior: ClassVar[float] = FREE
     free: ClassVar[bool] = True
@@ -189,6 +247,15 @@ class UnknownOfTwo(AbstractInstantEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownOfTwo"]:
         return []
+
+    @classmethod
+    def from_motions(cls, motions: Sequence[Motion]) -> Sequence["UnknownOfTwo"]:
+        low, high = _ranges(motions)
+        ends = lambda j, k: ((float(x[j]), float(x[k])) for x in (low, high))
+        return [
+            cls(j, k, *ends(j, k))
+            for j, k in itertools.permutations(np.flatnonzero(high - low > _MOVES).tolist(), 2)
+        ]
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -218,7 +285,7 @@ class UnknownOfSpeeds(AbstractInstantEffect):
     torque of bodies that are elsewhere than in the model is like that, pose by pose.
     """
 
-    name: ClassVar[str] = "unknown"
+    name: ClassVar[str] = UNNAMED
     prior: ClassVar[float] = FREE
     free: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
@@ -233,6 +300,15 @@ class UnknownOfSpeeds(AbstractInstantEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownOfSpeeds"]:
         return []
+
+    @classmethod
+    def from_motions(cls, motions: Sequence[Motion]) -> Sequence["UnknownOfSpeeds"]:
+        qd, out = np.concatenate([m.qd for m in motions]), []
+        for i, k in itertools.combinations_with_replacement(range(qd.shape[1]), 2):
+            largest = float(np.max(np.abs(qd[:, i] * qd[:, k])))
+            if largest > _SLOW:
+                out += [cls(j, i, k, largest) for j in range(qd.shape[1])]
+        return out
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -258,9 +334,10 @@ class UnknownDrag(AbstractArmEffect):
     such a force, a fluid, and a tool that rubs. A last joint that turns does so about that axis, and feels none.
     """
 
-    name: ClassVar[str] = "unknown"
+    name: ClassVar[str] = UNNAMED
     prior: ClassVar[float] = FREE
     reveals: ClassVar[str] = "the same path at several speeds, and with nothing fastened to the flange"
+    on_links: ClassVar[bool] = True
 
     dof: int = eqx.field(static=True)
     reach: float = eqx.field(static=True)
@@ -272,6 +349,13 @@ class UnknownDrag(AbstractArmEffect):
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownDrag"]:
         return []
+
+    @classmethod
+    def from_motions(cls, motions: Sequence[Motion]) -> Sequence["UnknownDrag"]:
+        knots = np.array(_OF_FASTEST) * _fastest(motions)
+        slides = bool(motions[0].arm.chain.prismatic[-1])
+        reaches = _REACHES if knots[0] > _SLOW else ()
+        return [cls(motions[0].dof, reach, tuple(knots.tolist()), slides) for reach in reaches]
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -321,15 +405,20 @@ class UnknownSpin(AbstractArmEffect):
     the Jacobian and the velocity of the link's rotation.
     """
 
-    name: ClassVar[str] = "unknown"
+    name: ClassVar[str] = UNNAMED
     prior: ClassVar[float] = FREE
     reveals: ClassVar[str] = "the same motion with what turns on the last link switched off"
+    on_links: ClassVar[bool] = True
 
     dof: int = eqx.field(static=True)
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownSpin"]:
         return []
+
+    @classmethod
+    def from_motions(cls, motions: Sequence[Motion]) -> Sequence["UnknownSpin"]:
+        return [cls(motions[0].dof)] if _OF_FASTEST[0] * _fastest(motions) > _SLOW else []
 
     @property
     def joints(self) -> tuple[int, ...]:
@@ -365,10 +454,12 @@ class UnknownShaking(AbstractArmEffect):
     with the base's acceleration $a \sin 2\pi f t + b \cos 2\pi f t$ along its axes, of each recording another.
     """
 
-    name: ClassVar[str] = "unknown"
+    name: ClassVar[str] = UNNAMED
     prior: ClassVar[float] = FREE
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("frequency", "Hz", 0.1, 1e3),)
     reveals: ClassVar[str] = "a recording with the base at rest"
+    swings: ClassVar[bool] = True
+    on_links: ClassVar[bool] = True
     bound_to_recording: ClassVar[bool] = True
     throughout: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
@@ -382,7 +473,15 @@ class UnknownShaking(AbstractArmEffect):
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownShaking"]:
-        return []  # the event scan proposes them
+        return []
+
+    @classmethod
+    def swinging(cls, dof: int, recordings: tuple[str, ...], frequency: float) -> "UnknownShaking":
+        return cls(dof, recordings, frequency)
+
+    @classmethod
+    def swung(cls, motion: Motion) -> Float[np.ndarray, "time dof n"]:
+        return -motion.gravity_columns
 
     @property
     def recordings(self) -> tuple[str, ...]:
@@ -420,9 +519,8 @@ class UnknownShaking(AbstractArmEffect):
         out = np.zeros((motion.samples, self.dof, len(self.coefficients)))
         if self.now:
             angle = 2 * np.pi * float(self.frequency) * motion.time
-            G = motion.gravity_columns
             waves = (wave(angle)[:, None, None] for wave in (np.sin, np.cos))
-            out[..., self._own] = np.concatenate([-G * wave for wave in waves], 2)
+            out[..., self._own] = np.concatenate([self.swung(motion) * wave for wave in waves], 2)
         return out
 
     def resist(self, c, arm, z, s, dt):
@@ -432,6 +530,12 @@ class UnknownShaking(AbstractArmEffect):
 
     def parameters(self, c, covariance):
         return [{**p, "joint": None} for p in super().parameters(c, covariance)]
+
+
+def _fastest(motions: Sequence[Motion]) -> float:
+    """Of the last link's frame [m/s]."""
+    moved = lambda m: np.einsum("tja,tj->ta", m.wrench_columns[:, -1, :, :3], m.qd)
+    return float(max(np.linalg.norm(moved(m), axis=1).max() for m in motions))
 
 
 def _from_rest(interp: Any, x: Any, knots: Sequence[float]) -> list[Any]:
@@ -446,7 +550,7 @@ class UnknownAt(AbstractDryFriction):
     $$\tau_j = \left(a + b\,x + c \tanh(\dot q_j/v_0)\right) e^{-x^2/2}, \qquad x = (q_j - q_0)/w$$
     """
 
-    name: ClassVar[str] = "unknown"
+    name: ClassVar[str] = UNNAMED
     seen_against: ClassVar[str] = "position"
     prior: ClassVar[float] = FREE
     free: ClassVar[bool] = True
@@ -464,7 +568,25 @@ class UnknownAt(AbstractDryFriction):
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownAt"]:
-        return []  # the search scans the places
+        return []
+
+    @classmethod
+    def sweep(cls, joint: int, motions: Sequence[Motion], cutoff: float) -> Sweep | None:
+        low, high = _ranges(motions)[:, joint]
+        widths = [max(w, (high - low) / _PLACES) for w in _SPOTS]
+        tried = [(at, w) for w in widths for at in np.arange(low + w, high - w, w)]
+        if not tried:
+            return None
+        place, width = np.transpose(tried)
+
+        def columns(motion: Motion) -> Float[np.ndarray, "time shapes 3"]:
+            x = (motion.q[:, joint, None] - place) / width
+            sign = np.tanh(motion.qd[:, joint, None] / SIGN_WIDTH)
+            bump = np.exp(-0.5 * x**2)
+            return np.stack([bump, x * bump, sign * bump], 2)
+
+        shape = lambda i: cls(joint, place=float(place[i]), width=float(width[i]))
+        return Sweep(columns, shape, lambda i: (0.4 * float(width[i]), 0.3))
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -495,7 +617,7 @@ class UnknownLimit(AbstractInstantEffect):
     $$\tau_j^{shown} = \tau_j - m\,(\tau_j - \mathrm{clip}(\tau_j, -L, L))$$
     """
 
-    name: ClassVar[str] = "unknown"
+    name: ClassVar[str] = UNNAMED
     seen_against: ClassVar[str] = "model torque"
     prior: ClassVar[float] = FREE
     shapes: ClassVar[tuple[Shape, ...]] = (Shape("limit", "N·m", 1e-3, 1e6),)
@@ -507,7 +629,12 @@ class UnknownLimit(AbstractInstantEffect):
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownLimit"]:
-        return []  # the limits are shares of the largest torque in the recordings
+        return []
+
+    @classmethod
+    def from_motions(cls, motions: Sequence[Motion]) -> Sequence["UnknownLimit"]:
+        largest = np.max([np.abs(m.torque_shown).max(0) for m in motions], 0)
+        return [cls(int(j), float(s * largest[j])) for j in np.flatnonzero(largest > 0) for s in _LIMITS]
 
     @property
     def form_prior(self) -> float:
@@ -541,9 +668,9 @@ EFFECTS = (
     Unknown,
     UnknownOfTwo,
     UnknownOfSpeeds,
-    UnknownDrag,
+    UnknownLimit,
     UnknownSpin,
+    UnknownDrag,
     UnknownShaking,
     UnknownAt,
-    UnknownLimit,
 )
