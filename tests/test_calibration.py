@@ -101,6 +101,7 @@ def test_what_is_hardly_likely_is_told_only_where_it_is_large_and_nothing_else_i
     assert are_told([likely, small, large], fit) == [True, False, False]
     assert are_told([small, large], fit) == [False, True]
     assert are_told([small], fit) == [False]
+    assert are_told([dataclasses.replace(large, foretold=-1.0)], fit) == [False]
     stuck = dataclasses.replace(small, terms=())
     assert are_told([stuck, large], fit) == [True, True]
     assert are_told([stuck, large, likely], fit) == [True, False, True]

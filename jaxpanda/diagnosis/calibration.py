@@ -61,15 +61,17 @@ def calibrated(findings: Sequence[Finding], verdict: str, fit: Fit) -> list[Find
 
 
 def are_told(findings: Sequence[Finding], fit: Fit) -> list[bool]:
-    """Which findings are likely enough to be right; where no effect is, those that are large, as something is
-    missing. What is no term of a model is told always."""
+    """Which findings are likely enough to be right; where no effect is, those by which something is missing. What
+    is no term of a model is told always."""
     any_likely = any(f.confidence >= TOLD for f in findings if f.terms)
-    return [not f.terms or (f.confidence >= TOLD if any_likely else is_large(f, fit)) for f in findings]
+    return [not f.terms or (f.confidence >= TOLD if any_likely else stands_out(f, fit)) for f in findings]
 
 
-def is_large(finding: Finding, fit: Fit) -> bool:
-    """Whether its torque stands out of a joint's noise."""
-    return bool(np.any(finding.rms_torque > SMALL * fit.noise_floor))
+def stands_out(finding: Finding, fit: Fit) -> bool:
+    """Whether something is missing, be it this finding or another: its torque stands out of a joint's noise, and
+    makes torque likelier that nothing was fitted to."""
+    large = bool(np.any(finding.rms_torque > SMALL * fit.noise_floor))
+    return large and (finding.foretold is None or finding.foretold > 0)
 
 
 def _error(fit: Fit) -> Float[np.ndarray, " dof"]:

@@ -24,7 +24,7 @@ from ..session import Say
 from . import knowledge as knowledge_
 from . import saved
 from .as_recorded import as_recorded, misleading
-from .calibration import SMALL, are_told, calibrated, is_large
+from .calibration import SMALL, are_told, calibrated, stands_out
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import VERDICTS, Finding, Fit
@@ -230,7 +230,7 @@ def sought(
         unsure = [f for f, on in zip(told, likely, strict=True) if not on]
         told = [f for f, on in zip(told, likely, strict=True) if on]
         notes.append(_too_unsure(unsure))
-        more = more or any(is_large(f, fitted) for f in unsure)
+        more = more or any(stands_out(f, fitted) for f in unsure)
         if not told:  # the user's model is as good as any
             kept = with_terms(problem, ())
             corrected, fitted = correct(kept), fit(problem, kept)
@@ -436,7 +436,7 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
     if not names:
         return "consistent"
     if UNNAMED not in names:
-        doubtful = any(f.confidence < DOUBTFUL and is_large(f, fit) for f in found)
+        doubtful = any(f.confidence < DOUBTFUL and stands_out(f, fit) for f in found)
         missed = bool(np.any(fit.held_out_rmse_after > SMALL * fit.noise_floor))
         unsure = missed and all(f.confidence < UNSURE for f in found)
         held_out = fit.held_out_rmse_before, fit.held_out_rmse_after
