@@ -12,6 +12,7 @@ from scipy.ndimage import maximum_filter1d
 from .arms.arm import Arm, unit_of
 from .errors import require_x64
 from .meaning import Meaning, meaning
+from .parameters import triangle
 from .recordings import Origin, Recording
 from .recordings.checks import velocity_scale
 from .signals import LONGEST_GAP, Signals, prepare, repeatability, white_noise, zero_phase
@@ -397,7 +398,7 @@ def _identifiable(
 
 
 def _singular_values(Y: Float[np.ndarray, "state dof parameter"]) -> Float[np.ndarray, " value"]:
-    return np.linalg.svd(Y.reshape(-1, Y.shape[-1]), compute_uv=False)
+    return np.linalg.svd(triangle(Y.reshape(-1, Y.shape[-1])), compute_uv=False)
 
 
 def _rank(singular_values: np.ndarray) -> int:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from ..arms.arm import Arm
 from ..errors import InputError
-from ..parameters import random_regressor
+from ..parameters import random_regressor, triangle
 from .bodies import Correction
 from .discrepancy import of_known
 from .traces import Trace
@@ -49,7 +49,7 @@ def inertial_spread(
     if knowledge == "rough":
         return _rough(arm)
     W = np.asarray(random_regressor(arm, _SAMPLES)).reshape(_SAMPLES, arm.dof, -1) / noise[:, None]
-    _, s, Vt = np.linalg.svd(W.reshape(-1, 10 * arm.dof), full_matrices=False)
+    _, s, Vt = np.linalg.svd(triangle(W.reshape(-1, 10 * arm.dof)))
     felt = s > 1e-8 * s[0]
     return Vt[felt].T / s[felt] * (1.0 if knowledge == "identified" else _UNKNOWN)
 

@@ -19,6 +19,7 @@ from ..effects import AbstractEffect
 from ..effects.native import nearest
 from ..errors import InputError
 from ..feasible.nearest import are_buildable, nearest_buildable
+from ..parameters import triangle
 from ..recordings import Recording
 from ..validation import torque_rmse
 from .problem import Problem
@@ -189,7 +190,7 @@ def _nearest(
     """The nearest links that can be built, and how far their torque is off in the recordings, rms [N m]."""
     weights = np.concatenate([t.weights for t in problem.traces]) / problem.noise(()).std
     felt = np.concatenate([t.motion.regressor for t in problem.traces])
-    _, root = np.linalg.qr((weights[:, :, None] * felt).reshape(-1, standard.size))
+    root = triangle((weights[:, :, None] * felt).reshape(-1, standard.size))
     carried = np.stack([link.lumped_standard for link in source.links])
     changed = np.flatnonzero(np.any(standard != source.standard, axis=1))
     built = nearest_buildable(standard, carried, source.standard, root, changed.tolist())

@@ -22,6 +22,7 @@ from jaxpanda_kernels import inertia
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..errors import InputError
+from ..parameters import triangle
 from . import interior, small
 from .bounds import Bounds
 from .constraints import Constraint
@@ -165,9 +166,7 @@ def _compressed(
 ) -> tuple[Float[np.ndarray, "least columns"], Float[np.ndarray, " least"]]:
     """The same sum of squares in one equation more than there are unknowns: one program serves any number."""
     both, least = np.column_stack([A, b]), A.shape[1] + 1
-    if len(both) > least:
-        both = np.linalg.qr(both, mode="r")
-    both = np.concatenate([both, np.zeros((least - len(both), least))])
+    both = triangle(both) if len(both) > least else np.pad(both, ((0, least - len(both)), (0, 0)))
     return both[:, :-1], both[:, -1]
 
 

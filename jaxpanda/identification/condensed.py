@@ -19,7 +19,8 @@ from .. import inputs
 from ..errors import InputError
 from ..files import write_npz
 from ..friction import Friction, linear
-from .regression import Masks, Regression, triangle, triangles, weighted_fit
+from ..parameters import triangle
+from .regression import Masks, Regression, triangles, weighted_fit
 
 FILE = "identification.npz"
 """Stands beside identification.json."""

@@ -25,8 +25,7 @@ from jaxtyping import Array, Float
 from .. import inputs
 from ..arms.arm import Arm
 from ..errors import InputError, require_x64
-from ..parameters import base_parameters
-from .regression import triangle
+from ..parameters import base_parameters, triangle
 from .result import RELIABLE, Identification, check_folds, of_model
 
 _SYMMETRIC = 1e-6  # of the largest entry of M

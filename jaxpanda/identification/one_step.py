@@ -22,8 +22,8 @@ from jaxtyping import Float
 from ..arms.arm import Arm
 from ..feasible import Bounds, Constraint, Solutions, solve
 from ..friction import least_beyond, linear
-from ..parameters import Base
-from .regression import Fit, Masks, Regression, least_squares, triangle, triangles
+from ..parameters import Base, triangle
+from .regression import Fit, Masks, Regression, least_squares, triangles
 from .statistics import covariances, samples_as_one
 
 PRIOR = 1.0

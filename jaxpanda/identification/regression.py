@@ -8,7 +8,6 @@ changes the noise and not the parameters. Joints are kept apart until the last s
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from ..arms.arm import Arm
 from ..errors import InputError
 from ..friction import columns
-from ..parameters import Base, base_parameters
+from ..parameters import Base, base_parameters, triangle
 from ..signals import Signals
 
 _CHUNK = 1024  # samples whose regressor is evaluated at once; bounds the memory
@@ -164,12 +163,6 @@ def triangles(regressions: Sequence[Regression], masks: Masks) -> Float[np.ndarr
         ]
         R.append(triangle(np.concatenate(parts)))
     return np.stack(R)
-
-
-def triangle(rows: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
-    """R, padded with rows of zeros where there are fewer rows than columns."""
-    R: Any = np.linalg.qr(rows, mode="r")
-    return np.concatenate([R, np.zeros((rows.shape[1] - len(R), rows.shape[1]))])
 
 
 @dataclasses.dataclass(frozen=True)

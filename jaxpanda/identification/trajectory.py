@@ -15,12 +15,12 @@ from ..arms.arm import Arm
 from ..errors import InputError, require_x64
 from ..feasible import Bounds, Constraint
 from ..friction import LINEAR, MODELS, Friction, check_model
-from ..parameters import Base, arm_base_parameters
+from ..parameters import Base, arm_base_parameters, triangle
 from ..recordings import Recording
 from ..signals import Signals, blocks_many, prepare, repeatability
 from .condensed import Condensed, Evidence
 from .one_step import PRIOR, Prior, feasible_least_squares
-from .regression import Fit, Masks, Regression, everything, excited, least_squares, regression, triangle
+from .regression import Fit, Masks, Regression, everything, excited, least_squares, regression
 from .result import RELIABLE, Identification, check_folds, of_model
 from .sigmoid import Shape, fit_shape, linearised, with_shape
 from .statistics import covariances, determined
