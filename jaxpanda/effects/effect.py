@@ -84,6 +84,10 @@ EVER = 1e9
 class AbstractEffect(eqx.Module):
     """Physics that a rigid-body model leaves out; the class is one effect, an instance one shape of it."""
 
+    # Equinox's makes a pytree of each method that is read, which nobody needs here; a diagnosis reads a million
+    # attributes.
+    __getattribute__ = object.__getattribute__
+
     name: ClassVar[str]
     """Name in the interface's table of effects."""
     family: ClassVar[str] = "unknown"
