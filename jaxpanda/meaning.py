@@ -99,6 +99,8 @@ _SMALL = 0.1
 """Least size of a joint's torque, as a share of the largest joint's."""
 _FACTORS = np.exp(np.arange(-9.6, 9.7, 0.1))
 """Factors between a column and the torque that are tried."""
+_TOGETHER, _NOTHING = 16, 40.0
+"""Factors that are tried together, and what counts for nothing beside something likelier [nats]."""
 _FAR = 5.0
 """A constant within this factor of 1 is a gain, a load or links, not a unit."""
 _ALONE = 30.0
@@ -487,20 +489,14 @@ class _Model:
         if np.any(self.known[:, j] != self.dry[:, j]):
             means.append(mean - self.known[:, j])
         P, determinants = self.products(j, np.column_stack([column, self.sliding[:, j], *means]))
-        F, said = self.frictions[:, None], []
+        F, squares = self.frictions[:, None], []
         for m in range(2, 2 + len(means)):
             yy, ym = P[..., 0, 0], P[..., 0, m] + F * P[..., 0, 1]
             mm = P[..., m, m] + 2 * F * P[..., 1, m] + F**2 * P[..., 1, 1] + determinants
-            yy, ym, mm = (x.reshape(-1, 1) for x in (yy, ym, mm))
-            said.append(-0.5 * (yy / factors**2 - 2 * ym / factors + mm))
-        said = np.concatenate(said)
+            squares.append(np.stack([yy.ravel(), ym.ravel(), mm.ravel()]))
+        said = _mixed(np.concatenate(squares, 1), 1 / factors)
         n = len(column)
-        return (
-            _logsumexp(said, axis=0)
-            - np.log(len(said))
-            - n * np.log(np.abs(factors))
-            - 0.5 * n * np.log(2 * np.pi)
-        )
+        return said - n * np.log(np.abs(factors)) - 0.5 * n * np.log(2 * np.pi)
 
     @functools.cached_property
     def tau(self) -> Float[np.ndarray, "n dof"]:
@@ -554,6 +550,22 @@ _regressors = jax.jit(
         in_axes=(None, 0, 0, 0, 0),
     )
 )
+
+
+def _mixed(squares: Float[np.ndarray, "3 hypotheses"], x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    r"""$\log$ of the mean over hypotheses of $\exp(-\tfrac12 (a x^2 - 2 b x + c))$; a, b, c: rows of `squares`.
+
+    Over a stretch of x what is `_NOTHING` below another hypothesis throughout adds nothing there.
+    """
+    at = lambda squares, x: -0.5 * ((squares[0] * x - 2 * squares[1]) * x + squares[2])
+    out = []
+    for some in np.split(x, range(_TOGETHER, len(x), _TOGETHER)):
+        ends = some.min(), some.max()
+        peak = np.clip(squares[1] / np.maximum(squares[0], 1e-300), *ends)
+        least = np.max(np.minimum(at(squares, ends[0]), at(squares, ends[1])))
+        counts = squares[:, at(squares, peak) > least - _NOTHING]
+        out.append(_logsumexp(at(counts[:, :, None], some), axis=0))
+    return np.concatenate(out) - np.log(squares.shape[1])
 
 
 def _logsumexp(x: np.ndarray, axis: int | None = None, keepdims: bool = False) -> Any:
