@@ -108,7 +108,8 @@ def triangle(rows: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "colu
     m, n = rows.shape
     out = np.zeros((n, n))
     if min(m, n):
-        factored, _, info = scipy.linalg.lapack.dgeqrt(min(_PANEL, m, n), np.array(rows, float, order="F"), 1)
+        factor = scipy.linalg.lapack.dgeqrt  # pyright: ignore[reportAttributeAccessIssue]
+        factored, _, info = factor(min(_PANEL, m, n), np.array(rows, float, order="F"), 1)
         assert info == 0
         out[: min(m, n)] = np.triu(factored[: min(m, n)])
     return out

@@ -73,6 +73,8 @@ _CHANNELS = {
 """What each is a function of, over a motion."""
 _KNOTS, _FEW = {"odd in dq": 8, "even in dq": 8, "of q": 10, "friction of q": 9}, 6
 """How many knots each has, and the others."""
+_NEARLY_ALL = (0.005, 0.995)
+"""Quantiles of a channel between which a function of it is told."""
 _VARIES = 1e-6
 """Range from which a channel can tell a function of it."""
 _MOVES = 0.02
@@ -90,10 +92,6 @@ _SPOTS, _PLACES = (0.03, 0.08), 64
 def _ranges(motions: Sequence[Motion]) -> Float[np.ndarray, "2 dof"]:
     """Where the joints have been, but for the extremes [rad]."""
     return np.quantile(np.concatenate([m.q for m in motions]), _NEARLY_ALL, axis=0)
-
-
-_NEARLY_ALL = (0.005, 0.995)
-"""Quantiles of a channel between which a function of it is told."""
 
 
 def _knots(form: str, x: Float[np.ndarray, " time"]) -> tuple[float, ...]:
