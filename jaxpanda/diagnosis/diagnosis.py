@@ -417,7 +417,8 @@ def held_out(problem: Problem, state: State) -> list[tuple[np.ndarray, np.ndarra
             dataclasses.replace(t, weight=t.weight * train)
             for t, (train, _) in zip(problem.traces, splits, strict=True)
         )
-        fitted = dataclasses.replace(problem, traces=traces).design(state.terms, state.noise)
+        part = dataclasses.replace(problem, traces=traces, silent=problem.silent_joints)
+        fitted = part.design(state.terms, state.noise)
         x = problem.explained(fitted.x, state.terms)
         for r, (_, test) in enumerate(splits):
             out[r][0][test] -= everything[r][test] @ x

@@ -121,6 +121,8 @@ class Problem:
     """Effects that are tried."""
     shapes: Grid | None = dataclasses.field(default=None, repr=False, compare=False)
     """Those of the same recordings and effects, likewise."""
+    silent: tuple[int, ...] | None = None
+    """Joints that no recording tells noise of, where a problem with more samples has told them."""
 
     def __getstate__(self) -> dict[str, Any]:
         """For pickle."""
@@ -379,6 +381,13 @@ class Problem:
         return Design(columns, residual, precision, (H, g), terms, self.corrections)
 
     @functools.cached_property
+    def silent_joints(self) -> tuple[int, ...]:
+        """Joints that no recording tells noise of."""
+        if self.silent is not None:
+            return self.silent
+        return tuple(j for j in range(self.dof) if not self.saturation.tells(j))
+
+    @functools.cached_property
     def _resting(self) -> list[tuple[int, Callable, np.ndarray, np.ndarray]]:
         """Joints that no recording tells noise of, as where friction holds them: what picks some rows of their
         columns, and the nuisance and the residual there, over the deviation of the torque.
@@ -386,12 +395,11 @@ class Problem:
         It is off by as much as with the user's model, and its rows together tell as much as one sample. Without
         that models differ there in ways that nothing bounds.
         """
-        joints = [j for j in range(self.dof) if not self.saturation.tells(j)]
         rows = np.unique(np.linspace(0, self.rows[-1].stop - 1, _PICKED).astype(int))
         each = [rows[(rows >= part.start) & (rows < part.stop)] - part.start for part in self.rows]
         some = lambda parts: np.concatenate([x[k] for x, k in zip(parts, each, strict=True)])
         out = []
-        for joint in joints:
+        for joint in self.silent_joints:
             residual = some([r[:, joint] for r in self.residual])
             size = max(float(np.sqrt(np.mean(residual**2))), QUIETEST) * np.sqrt(len(rows))
             nuisance = some([n[:, joint] for n in self.nuisance]) / size
