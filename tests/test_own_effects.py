@@ -189,6 +189,18 @@ def test_the_time_of_an_effect_of_one_s_own_is_searched_for(model):
     assert (likeliest.effect.start, likeliest.effect.stop) == pytest.approx((3.0, 5.0), abs=0.15)
 
 
+def test_an_effect_at_some_time_must_have_a_plausible_size():
+    class Unsized(BrakeLeftOn):
+        @property
+        def coefficients(self) -> tuple[Coefficient, ...]:
+            return (Coefficient("drag", "N·m·s/rad", sign=1),)
+
+    with pytest.raises(
+        InputError, match="Unsized acts at some time, and its coefficients lack a plausible size"
+    ):
+        catalogue_with([Unsized])
+
+
 def test_an_effect_of_a_recording_must_name_it(model):
     unnamed = type("Other", (CoupledDamping,), {"name": "slip", "bound_to_recording": True})
     with pytest.raises(InputError, match="Other is bound to a recording, and lacks its name"):

@@ -70,6 +70,12 @@ def catalogue_with(effects: Sequence[type[AbstractEffect]]) -> tuple[type[Abstra
             raise InputError(
                 f"effects: {effect.__name__} is bound to a recording, and lacks its name, a field recording: str"
             )
+        at_some_time = (form for forms in effect.at_some_time(2, "") for form in forms)
+        if any(k.scale is None for form in at_some_time for k in form.coefficients):
+            raise InputError(
+                f"effects: {effect.__name__} acts at some time, and its coefficients lack a plausible size:"
+                " such as Coefficient('drag', 'N·m·s/rad', scale=1.0)"
+            )
         taken = next((c for c in out if effect.name == c.name or effect.__name__ == c.__name__), None)
         if taken is not None:
             raise InputError(

@@ -170,7 +170,8 @@ class AbstractEffect(eqx.Module):
     @classmethod
     def at_some_time(cls, dof: int, recording: str) -> Sequence[Sequence["AbstractEffect"]]:
         """Of what begins or ends within a recording, at each place its forms, there throughout and with the same
-        columns: when it acts is searched for. `placed_between` makes one that acts for a while."""
+        columns: when it acts is searched for, and `placed_between` makes one that acts for a while. Their
+        coefficients have each a `scale`: noise may be as slow."""
         return ()
 
     @classmethod
