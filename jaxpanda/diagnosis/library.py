@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -26,8 +26,12 @@ class Candidates:
     """
 
     effects: tuple[AbstractEffect, ...]
-    joint: int | None
     columns: tuple[np.ndarray, ...]
+
+    @functools.cached_property
+    def joint(self) -> int | None:
+        """The one that they act in; None for the whole arm."""
+        return self.effects[0].joints[0] if self.effects[0].one_joint else None
 
     @property
     def name(self) -> str:
@@ -75,42 +79,37 @@ def build(traces: Sequence[Trace], catalogue: Sequence[type[AbstractEffect]]) ->
             groups[form_of(effect)].append(effect)
     for trace in traces:  # made once, before there are threads
         trace.motion.load, trace.motion.regressor, trace.motion.mass, trace.motion.slope  # noqa: B018
-    evaluated = parallel(
-        lambda effects: _by_joint(effects, [columns_of(effects, trace) for trace in traces]), groups.values()
-    )
-    return [candidates for group in evaluated for candidates in group]
-
-
-def _by_joint(effects: Sequence[AbstractEffect], columns: Sequence[np.ndarray]) -> list[Candidates]:
-    places: dict[tuple, list[int]] = defaultdict(list)
-    for i, effect in enumerate(effects):
-        places[effect.joints].append(i)
-    return [
-        Candidates(
-            tuple(effects[i] for i in at),
-            joints[0] if effects[0].one_joint else None,
-            tuple(c[..., at, :] for c in columns),
-        )
-        for joints, at in places.items()
-    ]
+    return _evaluated(traces, groups.values(), _by_joint)
 
 
 def from_motions(traces: Sequence[Trace], catalogue: Sequence[type[AbstractEffect]]) -> list[Candidates]:
     """Shapes that depend on where the recordings have been, each by itself."""
-    alike: dict[tuple, list[AbstractEffect]] = defaultdict(list)
+    groups: dict[tuple, list[AbstractEffect]] = defaultdict(list)
     for effect_class in catalogue:
         for effect in effect_class.from_motions([t.motion for t in traces]):
-            alike[form_of(effect), len(effect.coefficients)].append(effect)
+            groups[form_of(effect), len(effect.coefficients)].append(effect)
+    return _evaluated(traces, groups.values(), lambda effects: [[i] for i in range(len(effects))])
 
-    def evaluated(same: list[AbstractEffect]) -> list[Candidates]:
-        columns = [columns_of(same, trace) for trace in traces]
+
+def _evaluated(
+    traces: Sequence[Trace],
+    groups: Iterable[Sequence[AbstractEffect]],
+    split: Callable[[Sequence[AbstractEffect]], Iterable[list[int]]],
+) -> list[Candidates]:
+    """Groups of shapes of one form with their columns, each split into candidates."""
+
+    def one(effects: Sequence[AbstractEffect]) -> list[Candidates]:
+        columns = [columns_of(effects, trace) for trace in traces]
         return [
-            Candidates(
-                (effect,),
-                effect.joints[0] if effect.one_joint else None,
-                tuple(c[..., i : i + 1, :] for c in columns),
-            )
-            for i, effect in enumerate(same)
+            Candidates(tuple(effects[i] for i in at), tuple(c[..., at, :] for c in columns))
+            for at in split(effects)
         ]
 
-    return [one for group in parallel(evaluated, alike.values()) for one in group]
+    return [candidates for group in parallel(one, groups) for candidates in group]
+
+
+def _by_joint(effects: Sequence[AbstractEffect]) -> Iterable[list[int]]:
+    places: dict[tuple, list[int]] = defaultdict(list)
+    for i, effect in enumerate(effects):
+        places[effect.joints].append(i)
+    return places.values()

@@ -244,7 +244,7 @@ class TorqueRipple(AbstractInstantEffect):
         out = []
         for joint in range(motions[0].dof):
             travel = max(float(np.ptp(m.q[:, joint])) for m in motions)
-            least = 3 * np.pi / max(travel, 0.05)
+            least = least_order(max(travel, 0.05))
             out.append([cls(joint, max(order, least), "one") for order in _TYPICAL])
         return out
 

@@ -60,17 +60,17 @@ _AGAINST = {
 }
 """`seen_against` of each."""
 _CHANNELS = {
-    "odd in dq": lambda m, j: np.abs(m.qd[:, j]),
-    "even in dq": lambda m, j: np.abs(m.qd[:, j]),
-    "of q": lambda m, j: m.q[:, j],
-    "of load": lambda m, j: m.load[:, j],
-    "friction of q": lambda m, j: m.q[:, j],
-    "friction of load": lambda m, j: np.abs(m.load[:, j]),
-    "of ddq": lambda m, j: m.qdd[:, j],
-    "of q_k": lambda m, j: m.q[:, j],
-    "odd in dq_k": lambda m, j: np.abs(m.qd[:, j]),
+    "odd in dq": lambda s, j: abs(s.qd[..., j]),
+    "even in dq": lambda s, j: abs(s.qd[..., j]),
+    "of q": lambda s, j: s.q[..., j],
+    "of load": lambda s, j: s.load[..., j],
+    "friction of q": lambda s, j: s.q[..., j],
+    "friction of load": lambda s, j: abs(s.load[..., j]),
+    "of ddq": lambda s, j: s.qdd[..., j],
+    "of q_k": lambda s, j: s.q[..., j],
+    "odd in dq_k": lambda s, j: abs(s.qd[..., j]),
 }
-"""What each is a function of, over a motion."""
+"""What each is a function of, at an instant or over a motion; j: the joint, of the last two the source."""
 _KNOTS, _FEW = {"odd in dq": 8, "even in dq": 8, "of q": 10, "friction of q": 9}, 6
 """How many knots each has, and the others."""
 _NEARLY_ALL = (0.005, 0.995)
@@ -180,18 +180,7 @@ class Unknown(AbstractInstantEffect):
 
     def _hats(self, s: Channels) -> Float[Array, " n"]:
         """Share of each knot."""
-        qd = s.qd[self.joint]
-        x = {
-            "odd in dq": jnp.abs(qd),
-            "even in dq": jnp.abs(qd),
-            "of q": s.q[self.joint],
-            "of load": s.load[self.joint],
-            "friction of q": s.q[self.joint],
-            "friction of load": jnp.abs(s.load[self.joint]),
-            "of ddq": s.qdd[self.joint],
-            "of q_k": s.q[self.source],
-            "odd in dq_k": jnp.abs(s.qd[self.source]),
-        }[self.form]
+        x = _CHANNELS[self.form](s, self.source if self.form.endswith("_k") else self.joint)
         knots = jnp.asarray(self.knots)
         passed = jnp.clip((x - knots[:-1]) / jnp.diff(knots), 0.0, 1.0)  # share of each stretch below x
         return jnp.append(1.0, passed) - jnp.append(passed, 0.0)
