@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from .demo import demonstrate as demonstrate
     from .diagnosis import Diagnosis as Diagnosis
     from .diagnosis import diagnose as diagnose
-    from .diagnosis import predict as predict
     from .ensemble import Ensemble as Ensemble
     from .ensemble import draw_ensemble as draw_ensemble
     from .errors import InputError as InputError
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
     from .inspection import inspect as inspect
     from .payload import estimate_payload as estimate_payload
     from .pipeline import to_mjcf as to_mjcf
+    from .prediction import predict as predict
     from .reading import Reading as Reading
     from .recordings import Recording as Recording
     from .recordings import load as load
@@ -72,7 +72,7 @@ _HOME = {
     "draw_ensemble": "ensemble",
     "estimate_payload": "payload",
     "excite": "excitation",
-    "predict": "diagnosis",
+    "predict": "prediction",
     "identify": "identification",
     "identify_mass_gravity": "identification",
     "inspect": "inspection",

@@ -295,9 +295,9 @@ class Predict:
     """Print the main result as one JSON document and nothing else."""
 
     def run(self) -> Any:
-        from . import diagnosis
+        from . import prediction
 
-        return diagnosis.predict_files(
+        return prediction.predict_files(
             self.diagnosis, self.recording, self.out, reading=self.read, convention=self.convention
         )
 

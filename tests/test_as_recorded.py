@@ -10,12 +10,13 @@ import scipy.signal
 
 from jaxpanda import Arm, Recording
 from jaxpanda.corrected import Corrected, Recorded
-from jaxpanda.diagnosis.as_recorded import as_recorded, misleading, predicted
-from jaxpanda.diagnosis.traces import held_sign, prepare, trajectory
 from jaxpanda.effects import Turn
 from jaxpanda.effects.drive import Armature
 from jaxpanda.effects.friction import FrictionDrift, ViscousFriction
 from jaxpanda.effects.sensing import TorqueDrift
+from jaxpanda.prediction.as_recorded import as_recorded, misleading
+from jaxpanda.prediction.predict import predicted
+from jaxpanda.traces import held_sign, prepare, trajectory
 
 NOISE, JUDGED = np.full(7, 0.02), [True] * 7
 
@@ -155,7 +156,7 @@ def test_of_a_long_recording_the_beginning_is_compared(monkeypatch):
     half = len(first.time) // 2
     both = dataclasses.replace(first, tau=np.concatenate([first.tau[:half], later.tau[half:]]))
     assert as_recorded([trajectory(both)], corrected, JUDGED).turns != (SPEED,) * 7
-    monkeypatch.setattr("jaxpanda.diagnosis.as_recorded.LONG", float(first.time[half - 1]))
+    monkeypatch.setattr("jaxpanda.prediction.as_recorded.LONG", float(first.time[half - 1]))
     assert as_recorded([trajectory(both)], corrected, JUDGED).turns == (SPEED,) * 7
 
 

@@ -24,13 +24,13 @@ from jaxpanda.diagnosis.proposals import grids
 from jaxpanda.diagnosis.search import climb, exchange, merge, names, posterior, search, stand_ins
 from jaxpanda.diagnosis.shapes import refine
 from jaxpanda.diagnosis.state import likelier, misfit, places, start, with_terms
-from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
 from jaxpanda.effects.drive import JointSpring
 from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueDrift, TorqueOffset
 from jaxpanda.effects.unknown import Unknown
+from jaxpanda.traces import prepare
 
 
 def posed(*recordings):

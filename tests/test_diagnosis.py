@@ -34,7 +34,6 @@ from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Term
 from jaxpanda.diagnosis.search import crossed, exchange, instead, transferable
 from jaxpanda.diagnosis.state import torque, with_terms
-from jaxpanda.diagnosis.traces import prepare, trajectory
 from jaxpanda.diagnosis.written import buildable, corrected_document, worsened
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
@@ -48,6 +47,7 @@ from jaxpanda.feasible.nearest import are_buildable
 from jaxpanda.files import write_json
 from jaxpanda.report import to_html
 from jaxpanda.rollout import compare
+from jaxpanda.traces import prepare, trajectory
 
 
 def at_joint(joint: int, law):

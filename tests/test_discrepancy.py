@@ -25,7 +25,6 @@ from jaxpanda.diagnosis.state import (
     with_terms,
     without,
 )
-from jaxpanda.diagnosis.traces import prepare, trajectory
 from jaxpanda.effects import CATALOGUE, neighbours
 from jaxpanda.effects.drive import Armature, JointSpring, TorqueRipple
 from jaxpanda.effects.friction import (
@@ -39,6 +38,7 @@ from jaxpanda.effects.friction import (
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.effects.stribeck import StribeckFriction
+from jaxpanda.traces import prepare, trajectory
 
 DAMPING = 20.0
 

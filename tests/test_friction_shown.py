@@ -9,11 +9,11 @@ import pytest
 
 from jaxpanda import Arm, Recording
 from jaxpanda.corrected import Corrected
-from jaxpanda.diagnosis.as_recorded import predicted
 from jaxpanda.diagnosis.friction_shown import friction_shown
-from jaxpanda.diagnosis.traces import prepare, trajectory
 from jaxpanda.effects.sensing import TimeDelay, TorqueGain
 from jaxpanda.errors import InputError
+from jaxpanda.prediction.predict import predicted
+from jaxpanda.traces import prepare, trajectory
 
 NOISE = 0.05
 VISCOUS = np.array([8.0, 6.0, 5.0, 4.0, 2.0, 1.0, 0.0])

@@ -9,8 +9,8 @@ from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis.localise import change_points, localise, since_reversal, unbiased
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
-from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Motion
+from jaxpanda.traces import prepare
 
 AR = np.array([0.7, -0.2, 0.1])
 INNOVATION = 0.04

@@ -22,10 +22,10 @@ from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.proposals import grids
 from jaxpanda.diagnosis.state import with_terms
-from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects.friction import ViscousFriction
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.simulation import FourierTrajectory, JointFriction, Sensors, random_trajectory, simulate
+from jaxpanda.traces import prepare
 from jaxpanda.workspace.scene import CLEARANCE, reach_of, scene_of
 
 JOINT, OFFSET = 5, 0.03

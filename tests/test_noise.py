@@ -17,7 +17,7 @@ from jaxpanda.diagnosis.evidence import Noise, levelled
 from jaxpanda.diagnosis.noise import DETAILS, borne_out
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.state import _levelled_squares, beyond, slow_errors, start
-from jaxpanda.diagnosis.traces import prepare
+from jaxpanda.traces import prepare
 
 ARM = Arm.panda()
 LOAD = jax.jit(jax.vmap(lambda q, qd, qdd: rnea(ARM.chain, ARM.standard, q, qd, qdd)))

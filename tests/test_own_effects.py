@@ -17,7 +17,6 @@ from jaxpanda.diagnosis import page
 from jaxpanda.diagnosis.events import windows
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.state import start
-from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import (
     AbstractArmEffect,
     AbstractInstantEffect,
@@ -27,6 +26,7 @@ from jaxpanda.effects import (
     Shape,
     catalogue_with,
 )
+from jaxpanda.traces import prepare
 
 
 class CoupledDamping(AbstractInstantEffect):

@@ -11,9 +11,9 @@ from jaxpanda.diagnosis import diagnosis, premises
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.state import start, with_terms
-from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.simulation import JointFriction, Sensors, random_trajectory, simulate
+from jaxpanda.traces import prepare
 
 
 def test_what_healthy_recordings_show_may_be_refitted_in_all_recordings():

@@ -15,10 +15,10 @@ from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.arms.source import from_mjcf
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.resting import AtRest, judge
-from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import AbstractInstantEffect, Channels, Coefficient, LawAtRest, Levels, Motion
 from jaxpanda.errors import InputError
 from jaxpanda.recordings import save
+from jaxpanda.traces import prepare
 
 LOSS = 0.4
 """Of every joint [N m]."""

@@ -15,13 +15,13 @@ from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.diagnosis.shapes import _score
-from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.effects import Channels, Motion, Stretches, joint_columns
 from jaxpanda.effects import effect as effect_
 from jaxpanda.effects import motion as motion_
 from jaxpanda.effects.drive import TorqueRipple
 from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
+from jaxpanda.traces import prepare
 
 
 def recording(seed: int, seconds: float, rate: float = 400.0) -> Recording:

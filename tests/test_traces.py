@@ -11,13 +11,13 @@ from helpers import record
 from mjcf_cases import chain_of
 
 from jaxpanda import Arm, Recording
-from jaxpanda.diagnosis.traces import WORK_RATE, held_sign, prepare, trajectory, work_rate
 from jaxpanda.effects import Turn, joint_columns
 from jaxpanda.effects.friction import FrictionDrift, LoadDependentFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.motion import Channels
 from jaxpanda.effects.sensing import TorqueDrift
 from jaxpanda.errors import InputError
+from jaxpanda.traces import WORK_RATE, held_sign, prepare, trajectory, work_rate
 
 RATE, NOISE = 500.0, 0.05
 

@@ -9,12 +9,12 @@ from jaxpanda.diagnosis.events import Proposal
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.shapes import first_steps, refine, score
 from jaxpanda.diagnosis.state import places, start, with_terms
-from jaxpanda.diagnosis.traces import prepare
 from jaxpanda.diagnosis.uncertainty import covariances, leaning, polished
 from jaxpanda.effects import AbstractEffect, Motion
 from jaxpanda.effects.drive import TorqueRipple
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.stribeck import StribeckBristles, StribeckFriction
+from jaxpanda.traces import prepare
 
 ARM = Arm.panda()
 NOISE, CORRELATED = 0.05, 0.9

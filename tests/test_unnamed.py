@@ -17,9 +17,9 @@ from jaxpanda.diagnosis.diagnosis import fit
 from jaxpanda.diagnosis.events import swinging
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.state import start
-from jaxpanda.diagnosis.traces import prepare as prepare_trace
 from jaxpanda.diagnosis.unnamed import held_off, hum, standing_off, stuck
 from jaxpanda.signals import prepare
+from jaxpanda.traces import prepare as prepare_trace
 
 ARM = Arm.panda()
 LOAD = jax.jit(jax.vmap(lambda q, qd, qdd: rnea(ARM.chain, ARM.standard, q, qd, qdd)))

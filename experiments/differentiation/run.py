@@ -17,10 +17,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from jaxpanda import Arm, load
-from jaxpanda.diagnosis.traces import trajectory
 from jaxpanda.effects import Motion
 from jaxpanda.recordings import Recording
 from jaxpanda.smoothing import Smoothed, continued_derivatives
+from jaxpanda.traces import trajectory
 
 EDGE = 0.3
 """Left out at both ends [s], as in the trials."""

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import jaxpanda
 from jaxpanda import session
-from jaxpanda.diagnosis.host import return_freed
+from jaxpanda.host import return_freed
 
 
 def resident() -> float:

@@ -23,12 +23,12 @@ import scipy.stats
 from jaxtyping import Float
 
 from ..arms.arm import Arm
-from ..diagnosis import predict
 from ..errors import InputError, require_x64
 from ..friction import UNITS
 from ..identification.regression import base_rows
 from ..identification.statistics import BLOCKS
 from ..parameters import arm_base_parameters
+from ..prediction import predict
 from ..recordings import Recording
 from ..signals import prepare
 from .knowledge import KINDS, Known, differing, in_common, kind_of, known

@@ -18,18 +18,19 @@ from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
 from ..corrected import KIND, Corrected
 from ..effects import UNNAMED, AbstractEffect, law_of
+from ..host import on_host
 from ..posterior import FILE as POSTERIOR_FILE
+from ..prediction.as_recorded import as_recorded, misleading
 from ..recordings import Recording
 from ..session import Say
+from ..traces import Trace, trajectory
 from . import knowledge as knowledge_
 from . import saved
-from .as_recorded import as_recorded, misleading
 from .calibration import SMALL, are_told, calibrated, stands_out
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly
 from .finding import VERDICTS, Finding, Fit
 from .friction_shown import friction_shown
-from .host import on_host
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
 from .posterior import posterior_of
@@ -37,7 +38,6 @@ from .premises import Premises, settled
 from .problem import FOLDS, Problem, Term
 from .search import stand_ins, transferable
 from .state import State, with_terms
-from .traces import Trace, trajectory
 from .uncertainty import polished
 from .unnamed import BEYOND
 from .written import buildable

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, law_of, neighbours
+from ..traces import Trace
 from .library import turning
 from .noise import hats
-from .traces import Trace
 
 SEEN = 0.1
 """Discrepancy over the noise's deviation below which it is left out: it would change nothing."""

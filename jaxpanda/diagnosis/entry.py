@@ -1,4 +1,4 @@
-"""`diagnose`: which physics a simulation is missing, by recordings; `predict`: torque, by what it found."""
+"""`diagnose`: which physics a simulation is missing, by recordings."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float
 
 from ..arms import markup
 from ..arms.arm import Arm
@@ -14,19 +13,17 @@ from ..arms.export import panda_mjcf
 from ..arms.mjcf import with_gravity
 from ..arms.model_file import Model
 from ..arms.source import from_document, from_mjcf
-from ..corrected import read, read_sides
 from ..effects import AbstractEffect, catalogue_with
 from ..errors import InputError, require_x64
+from ..host import on_host
 from ..recordings import Recording, distinct, load
 from ..session import Say, silent
+from ..traces import Trace, prepare, work_rate
 from . import knowledge as knowledge_
-from .as_recorded import at_rows, predicted
 from .diagnosis import Diagnosis, sought
-from .host import on_host
 from .meaning import Misread, misread
 from .resting import AtRest, judge, rests, while_still
-from .traces import Trace, prepare, trajectory, work_rate
-from .two_sided import TwoSided, both, drive_alone, links_alone, notes_of, on_drives, on_motors, passed_on
+from .two_sided import TwoSided, both, drive_alone, links_alone, notes_of, on_drives, on_motors
 from .written import file_with
 
 Found = TypeVar("Found", AtRest, Misread)
@@ -163,40 +160,3 @@ def _require_live_torque(recording: Recording) -> None:
                 f"{recording.name}: column {name}_{stuck[0] + 1} never changes; a diagnosis needs torque as the"
                 " sensor gave it, with its noise"
             )
-
-
-def predict(
-    folder: str | Path, motion: str | Path | Recording, *, effects: Sequence[type[AbstractEffect]] = ()
-) -> Float[np.ndarray, "rows dof"]:
-    """Torque [N m] that the sensors would measure, for each row of a motion, from what `diagnose` saved.
-
-    Args:
-        folder: that `diagnose` wrote.
-        motion: of the arm.
-        effects: classes of your own that `diagnose` was given.
-
-    Raises:
-        InputError: no saved diagnosis in the folder, a motion of another arm, or an effect of an unknown class.
-    """
-    return predict_sides(folder, motion, effects=effects)[0]
-
-
-def predict_sides(
-    folder: str | Path, motion: str | Path | Recording, *, effects: Sequence[type[AbstractEffect]] = ()
-) -> tuple[Float[np.ndarray, "rows dof"], Float[np.ndarray, "rows dof"] | None]:
-    """`predict`, and the torque of the motors [N m] where the diagnosis was of both; else None."""
-    require_x64("a prediction")
-    recording = motion if isinstance(motion, Recording) else load(motion)
-    sides = read_sides(folder, effects)
-    corrected, _ = sides[0] if sides else read(folder, effects)
-    recording.require_dof(corrected.arm.dof)
-    drives = sides[1][0].for_motion(recording)[0] if sides else None
-    corrected, recording = corrected.for_motion(recording)
-    trace, torque = predicted(trajectory(recording.of_link_side()), corrected)
-    tau = at_rows(recording, trace.motion.time, torque)
-    if drives is None:
-        return tau, None
-    passed = passed_on(corrected, recording, tau)
-    view = dataclasses.replace(recording, tau=None, tau_motor=None, transmitted=passed)
-    trace, torque = predicted(trajectory(view), drives)
-    return tau, at_rows(recording, trace.motion.time, torque)

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, Sweep
+from ..host import parallel
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, levelled, log_bayes, log_mean_exp
-from .host import parallel
 from .problem import Problem
 
 BIN = 0.1

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from .traces import Trace
+from ..traces import Trace
 
 _TRUST = 1e-4
 """Weight of the model's own numbers, as a share of what the recordings say: it decides where they say nothing."""

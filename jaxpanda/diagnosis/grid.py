@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..effects import AbstractEffect, Sweep
+from ..traces import Trace
 from .library import Candidates, build, columns_of, from_motions
-from .traces import Trace
 
 _MEMORY = 1 << 28
 """Bytes of columns of shapes off the grid that are kept."""

@@ -19,9 +19,9 @@ from jaxtyping import Float
 from ..arms.arm import Arm
 from ..errors import InputError
 from ..parameters import random_regressor, triangle
+from ..traces import Trace
 from .bodies import Correction
 from .discrepancy import of_known
-from .traces import Trace
 
 Knowledge = Literal["exact", "identified", "rough", "unknown"]
 

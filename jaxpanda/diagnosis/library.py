@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, joint_columns, turns
-from .host import parallel
-from .traces import Trace
+from ..host import parallel
+from ..traces import Trace
 
 _BATCH = 4
 """Shapes that one compiled call takes: what a refinement tries at once. A grid takes several calls, for which

@@ -21,9 +21,9 @@ import scipy.stats
 from jaxtyping import Float
 
 from ..effects import least_order
+from ..traces import Trace
 from .evidence import Design, Noise
 from .problem import Problem, Term
-from .traces import Trace
 
 ALARM = 0.01
 """Probability that noise alone shows anything at all in one kind of test, all joints together."""

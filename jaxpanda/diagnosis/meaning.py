@@ -16,10 +16,10 @@ from ..corrected import Corrected
 from ..meaning import Meaning, borne_out, meaning
 from ..recordings import Recording
 from ..report import Section
+from ..traces import Trace
 from . import saved
 from .finding import Finding, Fit
 from .knowledge import Knowledge
-from .traces import Trace
 
 EQUATIONS = {
     "gravity_removed": "column = tau - g(q)",

@@ -27,18 +27,18 @@ from jaxtyping import Float
 from .. import files
 from ..arms.mjcf import MjcfSource
 from ..effects import UNNAMED, AbstractEffect, Channels, Motion
+from ..host import parallel
+from ..traces import TRIM, Trace, held_sign
 from .decide import DOUBTFUL
 from .events import Proposal, swept
 from .evidence import Noise
 from .finding import Finding
-from .host import parallel
 from .knowledge import Knowledge, nuisance
 from .library import columns_of
 from .motions import Surroundings, motions
 from .problem import Problem, Term, posed
 from .proposals import grids
 from .state import State, coefficients, independent
-from .traces import TRIM, Trace, held_sign
 
 WORTH = 0.05
 """Probability from which a rival is worth an experiment."""

@@ -16,9 +16,9 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from .host import parallel
+from ..host import parallel
+from ..traces import Trace
 from .library import turning
-from .traces import Trace
 
 ORDER = 3
 LEAST_FREE, FEWEST_FREE = 0.25, 25.0

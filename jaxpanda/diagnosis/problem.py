@@ -16,15 +16,15 @@ from .. import signals as signals_
 from ..arms.arm import Arm
 from ..effects import CATALOGUE, AbstractEffect, Channels, Stretches, joint_columns
 from ..errors import InputError
+from ..host import parallel
+from ..traces import Trace
 from .bodies import Body, Correction, body, corrections_of
 from .discrepancy import at_rest, known_at_rest, of_law, resting, unresolved, unresolved_known
 from .evidence import Columns, Design, Noise
 from .grid import Grid
-from .host import parallel
 from .library import Candidates
 from .noise import ORDER, QUIETEST, JointNoise, Saturation
 from .scan import Block, Family, Score, Whitened, families, projected, scan
-from .traces import Trace
 
 _UNHEARD = 1e9
 """Innovations of a joint that no recording tells anything about [N m]."""

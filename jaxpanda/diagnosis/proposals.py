@@ -7,11 +7,11 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 
 from ..effects import AbstractEffect
+from ..host import parallel
 from .alike import one_more
 from .credible import is_credible
 from .events import Proposal, swept, swinging, windows
 from .evidence import Design, Noise, log_mean_exp
-from .host import parallel
 from .library import Candidates
 from .problem import Problem
 from .shapes import evidence_of, first_steps, refine

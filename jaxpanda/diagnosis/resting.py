@@ -41,10 +41,10 @@ from ..effects import CATALOGUE, UNNAMED, AbstractEffect, LawAtRest, Levels, Mot
 from ..errors import InputError
 from ..recordings import Recording
 from ..report import Figure, Section, Table, number
+from ..traces import TRIM, Trace
 from . import saved
 from .finding import Finding, Fit
 from .knowledge import Knowledge, inertial_spread
-from .traces import TRIM, Trace
 
 YIELDS = 0.02
 """Travel below which an arm holds still [rad]: what gives way by milliradians under a force does not move."""

@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from ..arms.arm import Arm
 from ..effects import AbstractEffect
+from ..host import parallel
 from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, log_bayes
-from .host import parallel
 from .library import Candidates
 
 if TYPE_CHECKING:

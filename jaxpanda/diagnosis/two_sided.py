@@ -19,7 +19,6 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from .. import files
 from ..arms import markup
@@ -29,9 +28,9 @@ from ..arms.mjcf import MjcfSource
 from ..corrected import KIND, Corrected
 from ..effects import AbstractEffect
 from ..posterior import FILE as POSTERIOR_FILE
+from ..prediction.predict import at_rows, passed_on
 from ..recordings import Recording
 from . import saved
-from .as_recorded import at_rows
 from .diagnosis import Diagnosis
 from .finding import VERDICTS, Finding, Fit
 from .posterior import posterior_of_sides
@@ -191,13 +190,6 @@ def on_motors(found: Diagnosis, recordings: Sequence[Recording]) -> list[Recordi
         shown = motors.require_tau() - measured + fitted
         views.append(dataclasses.replace(motors, tau=shown, transmitted=fitted))
     return views
-
-
-def passed_on(
-    links: Corrected, recording: Recording, tau: Float[np.ndarray, "rows dof"]
-) -> Float[np.ndarray, "rows dof"]:
-    """Torque behind the drives in a recording, what the sensors there add to it taken off [N m]."""
-    return np.asarray(links.plant(recording.name).true(jnp.asarray(recording.time), jnp.asarray(tau)))
 
 
 def both(arm: Arm, links: Corrected, drives: Corrected) -> Corrected:

@@ -19,11 +19,11 @@ from scipy.signal.windows import hann
 
 from ..effects import UNNAMED, may_carry
 from ..signals import Signals, white_noise
+from ..traces import Trace
 from .calibration import SUREST
 from .finding import Finding, joined
 from .problem import Problem
 from .state import State, coefficients, mean_squares, misfit
-from .traces import Trace
 
 BEYOND = 4.0
 """Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""

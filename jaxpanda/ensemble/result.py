@@ -19,7 +19,6 @@ from ..arms.export import ExportResult, panda_mjcf, write_parameters
 from ..arms.mjcf import MjcfSource, move_standard
 from ..arms.source import from_document, from_mjcf
 from ..corrected import Corrected
-from ..diagnosis.traces import trajectory
 from ..effects import AbstractJointEffect, Stretches, joint_columns
 from ..errors import InputError
 from ..files import Kind, finite, output_folder, settle, write_json, write_npz
@@ -27,6 +26,7 @@ from ..friction import MODELS, Friction
 from ..inputs import read_json, read_npz
 from ..recordings import Recording
 from ..signals import prepare
+from ..traces import trajectory
 from ..validation import mjx_package
 
 SCHEMA = "jaxpanda.ensemble/1"

@@ -25,7 +25,6 @@ from ..diagnosis import diagnose as diagnose_
 from ..diagnosis.coverage import least_shown
 from ..diagnosis.premises import pose
 from ..diagnosis.state import start
-from ..diagnosis.traces import prepare as prepare_trace
 from ..errors import InputError, require_x64
 from ..feasible.nearest import are_buildable
 from ..identification import identify
@@ -35,6 +34,7 @@ from ..rollout import engine_model
 from ..session import Say, silent
 from ..signals import prepare
 from ..simulation import JointFriction, Sensors, SplineTrajectory, panda_sensors, simulate, with_sensors
+from ..traces import prepare as prepare_trace
 from .result import Fault, Rehearsal, Row
 
 SPREAD = 0.1

@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from ..corrected import Corrected, Recorded
 from ..effects import Turn
-from ..recordings import Recording
-from .traces import Trace, Trajectory, trajectory
+from ..traces import Trajectory, trajectory
+from .predict import predicted
 
 TURNS = (Turn("speed", 0.01), *(Turn("distance", x) for x in (3e-4, 7e-4, 1.5e-3, 3e-3, 6e-3)))
 """How friction of a gear may turn [rad/s, rad]."""
@@ -105,25 +105,6 @@ def misleading(whole: Sequence[Trajectory], corrected: Corrected, count: int) ->
         torque = torque - own.pop(worst)
         gone.add(worst)
     return gone
-
-
-def predicted(moved: Trajectory, corrected: Corrected) -> tuple[Trace, Float[np.ndarray, "time dof"]]:
-    """A motion on the grid of a prediction, and the torque there [N m]."""
-    out: dict[float | None, tuple[Trace, np.ndarray]] = {}
-    cutoffs = corrected.cutoffs or (None,) * corrected.arm.dof
-    for cutoff in dict.fromkeys(cutoffs):
-        trace = moved.trace(corrected.arm, corrected.turns, np.inf if cutoff is None else cutoff)
-        trace = trace.showing(corrected.friction_shown)
-        out[cutoff] = trace, corrected.measured_torque(trace.motion, trace.channels, trace.sign)
-    torque = np.stack([out[cutoff][1][:, joint] for joint, cutoff in enumerate(cutoffs)], 1)
-    return out[cutoffs[0]][0], torque
-
-
-def at_rows(
-    recording: Recording, time: Float[np.ndarray, " time"], torque: Float[np.ndarray, "time dof"]
-) -> Float[np.ndarray, "rows dof"]:
-    """Torque on a grid, for each row of a recording."""
-    return np.stack([np.interp(recording.time, time, column) for column in torque.T], 1)
 
 
 def _beginning(moved: Trajectory) -> Trajectory:

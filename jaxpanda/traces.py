@@ -17,13 +17,13 @@ import scipy.interpolate
 import scipy.ndimage
 from jaxtyping import Array, Bool, Float, Int
 
-from .. import signals as signals_
-from ..arms.arm import Arm
-from ..arms.mjcf import SOLIMP, SOLREF
-from ..effects import Channels, Motion, Stretches, Turn, masses
-from ..errors import InputError
-from ..recordings import Recording
-from ..smoothing import Smoothed, continued_derivatives, smooth
+from . import signals as signals_
+from .arms.arm import Arm
+from .arms.mjcf import SOLIMP, SOLREF
+from .effects import Channels, Motion, Stretches, Turn, masses
+from .errors import InputError
+from .recordings import Recording
+from .smoothing import Smoothed, continued_derivatives, smooth
 
 WORK_RATE = 100.0
 """Rate of the coarse grid, at most [Hz]."""
