@@ -23,7 +23,7 @@ from .arms.mjcf import SOLIMP, SOLREF
 from .effects import Channels, Motion, Stretches, Turn, masses
 from .errors import InputError
 from .recordings import Recording
-from .smoothing import Smoothed, continued_derivatives, smooth
+from .smoothing import RATIO, Smoothed, continued_derivatives, smooth
 
 WORK_RATE = 100.0
 """Rate of the coarse grid, at most [Hz]."""
@@ -33,9 +33,11 @@ rate, but at no lower one than the motion of an arm needs [Hz]."""
 FINER = 10.0
 """Rate of the fine grid over that of the coarse one, at most."""
 POSITION_CUTOFF = 12.0
-"""Low-pass of q before it is differentiated, at most [Hz]."""
+"""Low-pass of q before it is differentiated, at most, where the torque shows no faster motion [Hz]."""
 _LEAST_CUTOFF = 5.0
 """The least low-pass of q [Hz]."""
+_PIECE = 2.0
+"""Of a recording, about as long as a motion between two rests [s]."""
 TRIM = 0.4
 """Left out at both ends of a recording [s]."""
 _REST = 5.0
@@ -52,6 +54,10 @@ _TURN = 0.01
 velocity changes sign, the friction of a gear after it, and a filtered velocity shows neither."""
 _SHAKEN = (2.5, 5.0)
 """Where the bands begin in which noise of q, differentiated twice, may outweigh the motion [Hz]."""
+_NOISE_SHARE = 0.5
+"""Deviation of the share of an acceleration there that is noise."""
+_APART = float(np.sqrt(1 / 12))
+"""Deviation of the instants of position and torque in a row, in rows: anywhere in it."""
 _SHARPER, _SHARP = 2.5, 6.0
 """Where motion is looked for that a filter took away, in its cutoffs; and how far above noise it must be."""
 _RINGING = 0.2
@@ -130,13 +136,19 @@ class Trace:
         return np.minimum(_least_step(self.signals.tau), 1e9)
 
     @functools.cached_property
-    def shaken(self) -> Float[np.ndarray, "time dof bands"]:
-        r"""What noise of the encoders may have put into the nominal torque, in the bands where it is most of
-        $\ddot q$: $M_{\cdot k}(q)$ times joint k's acceleration in each."""
+    def shaken(self) -> Float[np.ndarray, "time dof columns"]:
+        r"""What was recorded otherwise than it was may have put into the nominal torque, by its deviations.
+
+        Noise of the encoders, in the bands where it is most of $\ddot q$: $M_{\cdot k}(q)$ times joint k's
+        acceleration in each. And that position and torque of a row were taken at instants of their own, some
+        part of a row apart, or a torque that jumps at the instant of a row: $\dot\tau$ times that time.
+        """
         qdd, rate = self.motion.qdd, 1 / self.motion.dt
         below = [signals_.zero_phase(qdd, cutoff, rate) for cutoff in _SHAKEN if cutoff < 0.45 * rate]
         bands = [high - low for low, high in itertools.pairwise([*below, qdd])]
-        return np.concatenate([self.motion.mass * band[:, None] for band in bands], 2)
+        apart = np.gradient(self.motion.load, self.motion.dt, axis=0) / self.signals.rate
+        noise = [_NOISE_SHARE * self.motion.mass * band[:, None] for band in bands]
+        return np.concatenate([*noise, _APART * apart[:, :, None]], 2)
 
     def showing(self, friction: Float[Array | np.ndarray, "2 dof"] | None) -> "Trace":
         """The same, where recordings show so much more friction than the model has: viscous [N m s/rad] and
@@ -242,7 +254,10 @@ def prepare(recording: Recording, arm: Arm, *, coarse: float = WORK_RATE) -> Tra
     rate, time, keep = rough.rate, rough.time, rough.keep
     position = _splined(recording, time)
     noise = None if rough.tau is None else signals_.white_noise(rough.tau)
-    cutoff_q = min(position_cutoff(position, noise, arm, rate), _FELT * coarse)
+    most = min(_FELT * coarse, 0.4 * rate)
+    cutoff_q = min(position_cutoff(position, noise, arm, rate), most)
+    if noise is not None:
+        cutoff_q = _cutoff_shown(recording, rough, position, arm, cutoff_q, most)
     q, qd, qdd = continued_derivatives(position, cutoff_q, rate)
     pretended = _pretended(position, _written_in(recording), cutoff_q, rate)
     trace = _on_grids(recording, rough, keep, (q, qd, qdd), pretended, arm, (), coarse)
@@ -281,7 +296,7 @@ def _on_grids(
     thin = next(k for k in range(min(stride, _thinnest(rate, coarse)), 0, -1) if stride % k == 0)
     fine = np.arange(keep[0] % thin, len(time), thin)
     kept, dt = (keep - fine[0]) // thin, thin / rate
-    cutoff = min(_FELT * rate / stride, 0.45 * rate)
+    cutoff = _coarse_cutoff(rate, stride)
     q, qd, qdd = moved
     slowest, jitter = (np.broadcast_to(x, q.shape)[fine] for x in pretended)
     settled = _settled(q[fine], jitter)
@@ -296,11 +311,7 @@ def _on_grids(
     held = held_fine[kept]
     if stride > thin:
         held = signals_.zero_phase(held_fine, cutoff, 1 / dt)[kept]
-    coarsely = lambda x: (signals_.zero_phase(x, cutoff, rate) if stride > 1 else x)[keep]
-    tau = None if signals.tau is None else coarsely(signals.tau)
-    passed = recording.transmitted
-    if passed is not None:
-        passed = coarsely(signals_.resampled(recording.time, passed, time))
+    tau, passed = _torques(recording, signals, keep)
     motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], held, passed)
 
     def finely(x: np.ndarray) -> np.ndarray:
@@ -313,6 +324,25 @@ def _on_grids(
     weight = _weight(recording.time, time[keep], rate)
     trust = np.ones(motion.q.shape)
     return Trace(recording.name, signals, channels, dt, motion, tau, weight, kept, cutoff, sign, trust)
+
+
+def _coarse_cutoff(rate: float, stride: int) -> float:
+    """Low-pass of what is taken at every so manyth sample [Hz]."""
+    return min(_FELT * rate / stride, 0.45 * rate)
+
+
+def _torques(
+    recording: Recording, signals: signals_.Signals, keep: Int[np.ndarray, " coarse"]
+) -> tuple[Float[np.ndarray, "coarse dof"] | None, Float[np.ndarray, "coarse dof"] | None]:
+    """Measured torque and what drives pass on to the links, low-passed, at the samples `keep` [N m]."""
+    stride, rate = int(np.min(np.diff(keep))), signals.rate
+    cutoff = _coarse_cutoff(rate, stride)
+    coarsely = lambda x: (signals_.zero_phase(x, cutoff, rate) if stride > 1 else x)[keep]
+    passed = recording.transmitted
+    return (
+        None if signals.tau is None else coarsely(signals.tau),
+        None if passed is None else coarsely(signals_.resampled(recording.time, passed, signals.time)),
+    )
 
 
 def _settled(
@@ -535,6 +565,47 @@ def position_cutoff(
     M = np.diag(masses(arm, q.mean(0)[None])[0])
     crossing = np.sqrt(noise / np.maximum(np.abs(M) * _position_noise(q), 1e-12)) / (2 * np.pi)
     return float(np.clip(1.3 * crossing.min(), min(_LEAST_CUTOFF, most), most))
+
+
+def _cutoff_shown(
+    recording: Recording,
+    signals: signals_.Signals,
+    q: Float[np.ndarray, "time dof"],
+    arm: Arm,
+    least: float,
+    most: float,
+) -> float:
+    r"""Of low-passes of q, from `least` to `most`, the one whose motion the torque shows best [Hz].
+
+    Noise of q says which acceleration is certain; how much faster the arm did move, the torque. Of each joint
+    that is what is left of it beside $a\,\tau_{nominal} + J \ddot q + d\,\dot q + f\,\mathrm{sign}(\dot q) + b$;
+    and less must be left than with the lowest by more than the standard error from piece to piece (Breiman et
+    al., Classification and Regression Trees, 1984).
+    """
+    keep = signals.keep
+    tau, passed = _torques(recording, signals, keep)
+    assert tau is not None
+    time, cutoffs = signals.time[keep], [least]
+    while cutoffs[-1] < most:
+        cutoffs.append(min(cutoffs[-1] * RATIO, most))
+    counts = _weight(recording.time, time, signals.rate) > 0
+    pieces = np.array_split(np.flatnonzero(counts), max(2, round(float(time[-1] - time[0]) / _PIECE)))
+    floor = np.maximum(signals_.white_noise(tau), 1e-12)
+    left = []
+    for cutoff in cutoffs:
+        here, qd, qdd = (x[keep] for x in continued_derivatives(q, cutoff, signals.rate))
+        load = Motion(arm, time, here, qd, qdd, np.zeros_like(tau), passed).load
+        rest = np.empty_like(tau)
+        for j in range(tau.shape[1]):
+            x = [load[:, j], qdd[:, j], qd[:, j], np.sign(qd[:, j]), np.ones(len(time))]
+            A, y = np.stack(x, 1), tau[:, j]
+            rest[:, j] = y - A @ np.linalg.lstsq(A[counts], y[counts])[0]
+        squares = [np.mean(rest[rows] ** 2, 0) + 1e-6 * floor**2 for rows in pieces]
+        left.append(np.sum(np.log(squares), 1))
+    gained = left[0] - np.array(left)
+    best = int(np.argmax(gained.mean(1)))
+    sure = gained[best].mean() > gained[best].std(ddof=1) / np.sqrt(len(pieces))
+    return cutoffs[best] if sure else least
 
 
 def _least_step(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from helpers import record
 from mjcf_cases import chain_of
+from scipy.interpolate import CubicSpline
 
 from jaxpanda import Arm, Recording
+from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.effects import Turn, joint_columns
 from jaxpanda.effects.friction import FrictionDrift, LoadDependentFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
@@ -108,17 +110,22 @@ def test_a_joint_that_never_moves_tells_nothing():
 
 
 def test_shaken_columns_are_the_inertial_torque_of_fast_accelerations():
-    """Their sum over joints and bands is M times the acceleration of a vibration, without that of the motion."""
+    """Their sum over joints and bands is half of M times the acceleration of a vibration, without that of the
+    motion; the last is the torque less what it was a row's deviation earlier."""
     t = np.arange(int(6 * RATE)) / RATE
     slow, fast = 0.5 * np.sin(2 * np.pi * 0.3 * t), 1e-3 * np.sin(2 * np.pi * 7.0 * t)
     trace = prepare(moved(slow + fast), Arm.panda())
     motion = trace.motion
     vibration = -1e-3 * (2 * np.pi * 7.0) ** 2 * np.sin(2 * np.pi * 7.0 * motion.time)
     expected = motion.mass.sum(2) * vibration[:, None]
-    assert trace.shaken.shape == (motion.samples, 7, 14)
+    assert trace.shaken.shape == (motion.samples, 7, 15)
     inner = slice(30, -30)
-    difference = (trace.shaken.sum(2) - expected)[inner]
+    difference = (2 * trace.shaken[:, :, :14].sum(2) - expected)[inner]
     assert np.sqrt(np.mean(difference**2)) < 0.15 * np.sqrt(np.mean(expected[inner] ** 2))
+    earlier = CubicSpline(motion.time, motion.load)(motion.time - 1 / RATE / np.sqrt(12))
+    apart = motion.load - earlier
+    error = (trace.shaken[:, :, 14] - apart)[inner]
+    assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(apart[inner] ** 2))
 
 
 def test_long_recordings_are_taken_at_a_lower_rate_together():
@@ -130,6 +137,27 @@ def test_long_recordings_are_taken_at_a_lower_rate_together():
     assert work_rate(short) == WORK_RATE
     one_row = Recording("one.csv", np.zeros(1), np.zeros((1, 7)), tau=np.zeros((1, 7)))
     assert work_rate([one_row]) == WORK_RATE  # how short it is says who reads it
+
+
+@pytest.mark.parametrize("felt", [True, False])
+def test_a_diagnosis_keeps_fast_motion_that_the_torque_shows(felt):
+    """Of a heavy arm that set out sharply the low-pass of q left 20 times the noise of its torque; but what only
+    the encoders show is no motion."""
+    t = np.arange(int(12 * RATE)) / RATE
+    slow, fast = 2 * np.pi * 0.3, 2 * np.pi * 9.0
+    wave, shaken = 0.5 * np.sin(slow * t), 2e-3 * np.sin(fast * t)
+    one = moved(wave + shaken)
+    noisy = one.q + 2e-4 * np.random.default_rng(1).normal(size=one.q.shape)
+    true = -(slow**2) * wave - (fast**2 * shaken if felt else 0.0)
+    model = mujoco.MjModel.from_xml_string(panda_mjcf())
+    data, torque = mujoco.MjData(model), []
+    for q, qd, qdd in zip(one.q, slow * 0.5 * np.cos(slow * t), true, strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, qd, qdd
+        mujoco.mj_inverse(model, data)
+        torque.append(data.qfrc_inverse.copy())
+    found = prepare(dataclasses.replace(one, q=noisy, tau=one.tau + np.array(torque)), Arm.panda())
+    error = found.motion.qdd - np.interp(found.motion.time, t, true)[:, None]
+    assert np.sqrt(np.mean(error**2)) < (0.6 if felt else 0.3) * np.std(fast**2 * shaken)
 
 
 def test_a_prediction_keeps_motion_that_is_fast_but_above_the_noise_of_q():

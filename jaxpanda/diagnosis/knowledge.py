@@ -28,8 +28,6 @@ Knowledge = Literal["exact", "identified", "rough", "unknown"]
 _SAMPLES = 1500
 """Samples, taken as independent, of the identification that "identified" supposes."""
 _FRICTION = {"exact": 0.0, "identified": 0.02, "rough": 0.2, "unknown": 10.0}
-_SHAKEN = 0.5
-"""Deviation of the share of an acceleration that is noise."""
 _UNKNOWN = 1e3
 """Deviation, in those of an identification, that passes for unknown."""
 
@@ -77,9 +75,9 @@ def nuisance(
     scale: float = 1.0,
 ) -> tuple[list[Float[np.ndarray, "_time dof _n"]], int, dict[int, Correction]]:
     """The columns N of each recording, how many of them are numbers of the model, and which of these are not to
-    be negative; the others are what its friction may be off and noise of the encoders, which no knowledge takes
-    away. `std`: of the noise [N m]; `scale` multiplies the uncertainty of friction and rotors where it is
-    "rough"."""
+    be negative; the others are what its friction may be off and what was recorded otherwise than it was, which
+    no knowledge takes away. `std`: of the noise [N m]; `scale` multiplies the uncertainty of friction and rotors
+    where it is "rough"."""
     arm = traces[0].motion.arm
     damping, level, armature = spreads = friction_spread(arm, knowledge, scale)
     held = [
@@ -99,7 +97,7 @@ def nuisance(
         for j in np.flatnonzero(armature > 0):
             parts.append((armature[j] * trace.motion.qdd)[:, :, None] * joints[:, j : j + 1])
         numbers = sum(p.shape[2] for p in parts)
-        out.append(np.concatenate([*parts, off, _SHAKEN * trace.shaken], 2))
+        out.append(np.concatenate([*parts, off, trace.shaken], 2))
     return out, numbers, dict(enumerate(held, spread.shape[1]))
 
 
