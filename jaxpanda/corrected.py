@@ -103,6 +103,12 @@ class Corrected(eqx.Module):
     """Viscous [N m s/rad] and Coulomb friction [N m] of the recordings beyond the model's: of the sensors' laws,
     those in proportion to torque were fitted to torque with this friction. None, where it is the model's."""
 
+    @classmethod
+    def of(cls, arm: Arm) -> "Corrected":
+        """An arm that nothing was missing of."""
+        zero = jnp.zeros(arm.dof)
+        return cls(arm, jnp.zeros((arm.dof, 10)), zero, zero, (), ())
+
     @property
     def native(self) -> Arm:
         """The arm with every effect that MuJoCo's own attributes can hold, and the better-known numbers."""

@@ -57,8 +57,7 @@ def dahl(q: np.ndarray, distance: float, z: float) -> np.ndarray:
 def test_friction_of_the_model_turns_in_predictions_as_it_did_in_the_recordings(turns):
     """Each joint's in its own way; the prediction is then right to the noise."""
     arm = dataclasses.replace(Arm.panda(), frictionloss=jnp.full(7, 0.5))
-    zeros = jnp.zeros(7)
-    corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
+    corrected = Corrected.of(arm)
     recording = rubbing(arm, turns)
     found = as_recorded([trajectory(recording)], corrected, JUDGED)
     assert found.turns == turns
@@ -83,8 +82,7 @@ def test_bristles_that_one_moment_shows_and_the_rest_of_a_recording_does_not_are
     tau = trajectory(still).trace(dataclasses.replace(arm, frictionloss=jnp.zeros(7))).motion.torque
     tau[:, 2] += 0.5 * np.where(shakes, dahl(q[:, 2], 1.5e-3, 1.0), np.tanh(qd / 0.01))
     moved = [trajectory(dataclasses.replace(still, tau=tau + NOISE * rng.normal(size=q.shape)))]
-    zeros = jnp.zeros(7)
-    corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
+    corrected = Corrected.of(arm)
     turning = lambda turn: dataclasses.replace(corrected, turns=(None, None, turn, *[None] * 4))
     error = [np.std((predicted(moved[0], turning(turn))[1] - tau)[:, 2]) for turn in (SPEED, BRISTLES)]
     assert error[1] < 0.9 * error[0]
@@ -93,8 +91,7 @@ def test_bristles_that_one_moment_shows_and_the_rest_of_a_recording_does_not_are
 
 def test_a_speed_over_which_friction_turns_in_all_joints_is_still_read():
     """As earlier versions wrote it."""
-    zeros = jnp.zeros(7)
-    document = Corrected(Arm.panda(), jnp.zeros((7, 10)), zeros, zeros, (), ()).to_json()
+    document = Corrected.of(Arm.panda()).to_json()
     del document["turns"]
     assert Corrected.from_json({**document, "turning": 0.01}).turns == (SPEED,) * 7
     assert Corrected.from_json({**document, "turning": None}).turns == ()
@@ -117,8 +114,7 @@ def reversing(arm: Arm, filtered: tuple[int, ...], speed: float) -> Recording:
 def test_prediction_takes_no_more_of_fast_motion_than_the_torque_showed():
     """At joints whose torque was filtered, and at no other; the next motion is faster."""
     arm = Arm.panda()
-    zeros = jnp.zeros(7)
-    plain = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
+    plain = Corrected.of(arm)
     found = as_recorded([trajectory(reversing(arm, (1, 3), 6.0))], plain, JUDGED)
     assert [cutoff is not None for cutoff in found.cutoffs] == [j in (1, 3) for j in range(7)]
     assert Corrected.from_json(found.to_json()).cutoffs == found.cutoffs
@@ -135,8 +131,8 @@ def test_torque_of_a_joint_that_was_not_judged_is_filtered_as_it_shows_or_as_tha
     judged, others_are
 ):
     """The iiwa's joints that rest while one moves fast showed less of that than its own torque did."""
-    arm, zeros = Arm.panda(), jnp.zeros(7)
-    plain = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
+    arm = Arm.panda()
+    plain = Corrected.of(arm)
     swings = trajectory(reversing(arm, (1, 3), 6.0))
     found = as_recorded([swings], plain, [j in judged for j in range(7)])
     below = found.cutoffs or (None,) * 7
@@ -149,8 +145,8 @@ def test_torque_of_a_joint_that_was_not_judged_is_filtered_as_it_shows_or_as_tha
 
 def test_of_a_long_recording_the_beginning_is_compared(monkeypatch):
     """Friction that turns otherwise in what follows, and is stronger there, decides nothing if left out."""
-    arm, zeros = dataclasses.replace(Arm.panda(), frictionloss=jnp.full(7, 0.5)), jnp.zeros(7)
-    corrected = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, (), ())
+    arm = dataclasses.replace(Arm.panda(), frictionloss=jnp.full(7, 0.5))
+    corrected = Corrected.of(arm)
     first = rubbing(arm, (SPEED,) * 7)
     later = rubbing(dataclasses.replace(arm, frictionloss=jnp.full(7, 5.0)), ())
     half = len(first.time) // 2
@@ -170,8 +166,8 @@ def test_torque_of_changed_links_is_that_of_the_regressor():
 def test_effects_that_make_the_recordings_own_torque_worse_are_named():
     """An armature that is not there follows the sharp turns; damping that is there stays beside it."""
     arm = dataclasses.replace(Arm.panda(), damping=jnp.full(7, 0.5))
-    recording, zeros = reversing(arm, (), 6.0), jnp.zeros(7)
-    lacking = Corrected(Arm.panda(), jnp.zeros((7, 10)), zeros, zeros, (), ())
+    recording = reversing(arm, (), 6.0)
+    lacking = Corrected.of(Arm.panda())
     damped = tuple(ViscousFriction(j) for j in range(7)), (jnp.array([0.5]),) * 7
     right = dataclasses.replace(lacking, effects=damped[0], coefficients=damped[1])
     assert misleading([trajectory(recording)], right, 7) == set()
@@ -201,13 +197,13 @@ def test_a_motion_whose_clock_is_its_own_comes_after_the_recordings():
 
 def test_friction_goes_on_from_what_it_had_come_to_and_a_sensor_is_tared():
     """In a motion with a clock of its own; the recording itself is predicted by its own time."""
-    arm, zeros = Arm.panda(), jnp.zeros(7)
+    arm = Arm.panda()
     recording = rubbing(arm, ())
     channels = [prepare(recording, arm).channels]
     bias = TorqueDrift(2, 1.0, "extra").beyond(channels)
     warmth = FrictionDrift(0, 1.0, 0.001, "level extra").beyond(channels)
     drifting = (bias, warmth), (jnp.array([2.0]), jnp.array([3.0]))
-    found = Corrected(arm, jnp.zeros((7, 10)), zeros, zeros, *drifting)
+    found = dataclasses.replace(Corrected.of(arm), effects=drifting[0], coefficients=drifting[1])
     found = as_recorded([trajectory(recording)], found, JUDGED)
     plain = dataclasses.replace(found, effects=(), coefficients=())
     for q, sensor, friction in ((recording.q, 0.0, 0.0), (recording.q + 1e-3, 0.0, 3.0)):

@@ -227,8 +227,7 @@ def test_a_recording_of_another_arm_is_refused(capsys, tmp_path):
 def test_a_prediction_says_how_far_it_is_from_torque_that_was_recorded(capsys, tmp_path):
     """A user had to work out the error of a prediction from two files."""
     arm = jaxpanda.Arm.from_mjcf(MODELS / "odd_axes.xml")
-    zero = jax.numpy.zeros(arm.dof)
-    nothing = jaxpanda.Corrected(arm, jax.numpy.zeros((arm.dof, 10)), zero, zero, (), ())
+    nothing = jaxpanda.Corrected.of(arm)
     write_json(tmp_path / "corrected.json", {**nothing.to_json(), "torque_noise": [0.05] * arm.dof})
     recorded = shaken(arm, lambda qd: 0.3 * qd)
     said = {}

@@ -656,7 +656,7 @@ def test_prediction_refuses_a_folder_without_a_diagnosis(tmp_path):
 
 
 def test_prediction_refuses_a_corrected_arm_that_is_not_whole(tmp_path):
-    one = Corrected(Arm.panda(), jnp.zeros((7, 10)), jnp.zeros(7), jnp.zeros(7), (), ())
+    one = Corrected.of(Arm.panda())
     document = {**one.to_json(), "torque_noise": [0.1] * 7}
     write_json(tmp_path / "corrected.json", document)
     assert np.isfinite(predict(tmp_path, record(0))).all()

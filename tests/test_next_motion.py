@@ -77,18 +77,16 @@ def known(recorded):
     problem, spread = posed(record(recorded, 0))
     state = with_terms(problem, (problem.term(TorqueOffset(JOINT), np.array([0.05])),))
     finding = Finding(
-        "torque_offset",
-        (JOINT,),
-        ("0.csv",),
-        None,
-        0.6,
-        (("asymmetric_friction", 0.4),),
-        "",
-        (),
-        np.zeros(7),
-        0.0,
-        "",
-        (0,),
+        effect="torque_offset",
+        joints=(JOINT,),
+        recordings=("0.csv",),
+        confidence=0.6,
+        alternatives=(("asymmetric_friction", 0.4),),
+        equation="",
+        rms_torque=np.zeros(7),
+        evidence=0.0,
+        summary="",
+        terms=(0,),
     )
     return problem, spread, state, finding
 

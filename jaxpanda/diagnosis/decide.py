@@ -121,7 +121,6 @@ def numbers(
                 effect=name,
                 joints=joints,
                 recordings=tuple(t.name for t in suspect),
-                intervals=None,
                 confidence=REFITTED,
                 alternatives=((law_of("scale").name, round(1 - REFITTED, 3)),),
                 equation=f"tau = {law}",
@@ -136,7 +135,6 @@ def numbers(
                 f" together they explain {np.sqrt(felt[strongest]):.3g}"
                 f" {problem.arm.unit('N·m', strongest)} rms at joint {strongest + 1}."
                 " Torque sensors of a wrong scale could look alike.",
-                terms=(),
             )
         )
     return sorted(out, key=lambda f: -f.evidence)

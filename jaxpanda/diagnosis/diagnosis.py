@@ -78,11 +78,6 @@ class Diagnosis:
     """How closely both simulations follow recordings, as `jaxpanda.rollout.compare` says it; may be left out."""
 
     @property
-    def corrected_xml(self) -> str:
-        """Text of the corrected MJCF."""
-        return self.written.text
-
-    @property
     def bare(self) -> "Diagnosis":
         """The same, without what its search keeps and can be made again."""
         return dataclasses.replace(self, problem=self.problem.bare)
@@ -119,24 +114,18 @@ class Diagnosis:
     @on_host
     def to_json(self) -> dict[str, Any]:
         """diagnosis.json."""
-        return {
-            "schema": "jaxpanda.diagnosis/1",
-            "verdict": self.verdict,
-            "findings": [f.to_json() for f in self.findings],
-            "fit": self.fit.to_json(),
-            "notes": list(self.notes),
-            "localisation": {
+        return saved.document(
+            self,
+            self.knowledge,
+            localisation={
                 when: found.to_json()
                 for when, found in zip(("before", "after"), self.localisation, strict=True)
             },
-            "heat_map": self.heat_map.to_json(),
-            "smallest_shown": [one.to_json() for one in self.least_shown],
-            "next_experiment": None if self.next_motion is None else self.next_motion.to_json(),
-            "replays": [dict(one) for one in self.replays],
-            "knowledge": self.knowledge,
-            "sources": [dict(one) for one in self.sources],
-            "log": list(self.log),
-        }
+            heat_map=self.heat_map.to_json(),
+            smallest_shown=[one.to_json() for one in self.least_shown],
+            next_experiment=None if self.next_motion is None else self.next_motion.to_json(),
+            log=list(self.log),
+        )
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
         """For each recording its name, times [s], and what is left of the torque before and after [N m]."""
@@ -146,10 +135,7 @@ class Diagnosis:
 
     def lines(self) -> list[str]:
         """Verdict and findings in plain sentences."""
-        return [
-            VERDICTS[self.verdict],
-            *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings),
-        ]
+        return [VERDICTS[self.verdict], *saved.sentences(self.findings)]
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
         """Write diagnosis.json, corrected.xml with what it includes, corrected.json, and posterior.npz;

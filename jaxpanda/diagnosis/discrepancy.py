@@ -15,6 +15,7 @@ References:
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import scipy.linalg
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, law_of, neighbours
@@ -162,12 +163,7 @@ def of_known(
 def _hats(traces: Sequence[Trace], joint: int, channel: str) -> Float[np.ndarray, "rows n"]:
     if channel == "moments":
         parts = [hats(t.motion.time, max(3, round(np.ptp(t.motion.time) / _PERIOD))) for t in traces]
-        wide = np.zeros((sum(map(len, parts)), sum(p.shape[1] for p in parts)))
-        row = column = 0
-        for p in parts:
-            wide[row : row + len(p), column : column + p.shape[1]] = p
-            row, column = row + len(p), column + p.shape[1]
-        return wide
+        return np.asarray(scipy.linalg.block_diag(*parts))
     x = {
         "q": lambda t: t.motion.q[:, joint],
         "qd": lambda t: t.motion.qd[:, joint],

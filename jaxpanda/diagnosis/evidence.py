@@ -377,11 +377,6 @@ class Design:
         return scipy.linalg.cho_factor(H, lower=True)[0]
 
     @property
-    def covariance(self) -> Float[np.ndarray, "n n"]:
-        """Of the coefficients, given the data."""
-        return self.solve(np.eye(len(self.g)))
-
-    @property
     def log_evidence(self) -> float:
         """Log evidence of the whole model, up to a constant of the data."""
         if self.factor is None:

@@ -21,7 +21,7 @@ VERDICTS = {
 """Each verdict as a sentence."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Finding:
     """One effect that the model was missing."""
 
@@ -29,17 +29,18 @@ class Finding:
     joints: tuple[int, ...]
     """0-based."""
     recordings: tuple[str, ...]
-    intervals: tuple[tuple[float, float], ...] | None
+    intervals: tuple[tuple[float, float], ...] | None = None
+    """When it acts [s]; None: throughout."""
     confidence: float
     """Probability that it is right."""
-    alternatives: tuple[tuple[str, float], ...]
+    alternatives: tuple[tuple[str, float], ...] = ()
     equation: str
-    parameters: tuple[Mapping[str, Any], ...]
+    parameters: tuple[Mapping[str, Any], ...] = ()
     rms_torque: Float[np.ndarray, " dof"]
     evidence: float
     """Over the model without it [nats]."""
     summary: str
-    terms: tuple[int, ...]
+    terms: tuple[int, ...] = ()
     """Which terms of the model it consists of."""
     posterior: float | None = None
     """Weight among the models compared, of which `calibration` made the confidence."""

@@ -20,7 +20,7 @@ import scipy.special
 import scipy.stats
 from jaxtyping import Float
 
-from ..effects import least_order
+from ..effects import SIGN_WIDTH, least_order
 from ..traces import Trace
 from .evidence import Design, Noise
 from .problem import Problem, Term
@@ -41,7 +41,6 @@ REGIMES = {
     "time, odd": "time, with the sign of the velocity: warming up",
 }
 """What a residual is binned by, and what that means."""
-_SIGN_WIDTH = 0.01
 _LAGS = np.linspace(-0.1, 0.1, 41)
 _NARROWEST = 5
 """Samples of the narrowest window in the search for change points."""
@@ -249,7 +248,7 @@ def _regimes(problem: Problem, design: Design, noise: Noise, joint: int) -> list
         parts = [part(t) for t in traces]
         return np.split(hats(np.concatenate(parts), count), np.cumsum([len(p) for p in parts])[:-1])
 
-    sign = [t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / _SIGN_WIDTH))[:, None] for t in traces]
+    sign = [t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / SIGN_WIDTH))[:, None] for t in traces]
     speed = binned(lambda t: np.abs(t.motion.qd[:, joint]), 6)
     load = binned(lambda t: t.motion.load[:, joint], 6)
     carried = binned(lambda t: np.abs(t.motion.load[:, joint]), 4)

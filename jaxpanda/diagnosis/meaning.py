@@ -1,25 +1,21 @@
 """A torque column that is not joint torque: one finding that says what it is, and no physics sought in it."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from .. import summaries
-from ..arms import markup
-from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
 from ..meaning import Meaning, borne_out, meaning
 from ..recordings import Recording
 from ..report import Section
 from ..traces import Trace
-from . import saved
 from .finding import Finding, Fit
 from .knowledge import Knowledge
+from .saved import AbstractAsItIs
 
 EQUATIONS = {
     "gravity_removed": "column = tau - g(q)",
@@ -33,60 +29,16 @@ EQUATIONS = {
 """What each kind of column holds, by the torque that inverse dynamics gives."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Misread:
-    """Recordings whose torque is not what the model's inverse dynamics gives; fields as of `Diagnosis`."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Misread(AbstractAsItIs):
+    """Recordings whose torque is not what the model's inverse dynamics gives."""
 
-    findings: tuple[Finding, ...]
-    fit: Fit
-    """Of the user's model, before and after alike [N m]."""
-    corrected: Corrected
-    """The user's model as it is."""
-    source: MjcfSource = dataclasses.field(repr=False)
-    notes: tuple[str, ...]
-    knowledge: Knowledge
     verdict: str = "unexplained"
     """No physics was sought, so that none is explained."""
-    sources: tuple[Mapping[str, str], ...] = ()
-    replays: tuple[Mapping[str, Any], ...] = ()
 
     @property
-    def written(self) -> markup.Document:
-        return self.source.document
-
-    @property
-    def corrected_xml(self) -> str:
-        return self.written.text
-
-    def to_json(self) -> dict[str, Any]:
-        """diagnosis.json; null where something takes torque that is understood."""
-        return {
-            "schema": "jaxpanda.diagnosis/1",
-            "verdict": self.verdict,
-            "findings": [f.to_json() for f in self.findings],
-            "fit": self.fit.to_json(),
-            "notes": list(self.notes),
-            "localisation": None,
-            "heat_map": None,
-            "smallest_shown": [],
-            "next_experiment": None,
-            "replays": [],
-            "knowledge": self.knowledge,
-            "sources": [dict(one) for one in self.sources],
-            "log": [],
-        }
-
-    def lines(self) -> list[str]:
-        """Verdict and findings in plain sentences."""
-        first = (
-            "The torque in the recordings is not what inverse dynamics gives: no physics was sought in it."
-        )
-        return [first, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]
-
-    def save(self, folder: str | Path) -> tuple[str, ...]:
-        """Write diagnosis.json, corrected.xml and corrected.json, of the user's model as it is."""
-        saved.write(self, folder)
-        return missing_assets(self.written, Path(folder))
+    def opening(self) -> str:
+        return "The torque in the recordings is not what inverse dynamics gives: no physics was sought in it."
 
 
 def misread(
@@ -114,14 +66,13 @@ def misread(
     rms = np.sqrt(np.mean(np.concatenate([t.residual * t.weight[:, None] for t in traces]) ** 2, 0))
     floors = [t.signals.noise for t in traces if t.signals.noise is not None]
     floor = np.maximum(np.mean(floors, 0), 1e-9) if floors else np.full(arm.dof, 1e-9)
-    zero = jnp.zeros(arm.dof)
     others = sorted({one.name for one in recordings} - {name for name, _ in told})
     notes = [f"torque is joint torque, or cannot be told, in {', '.join(others)}"] if others else []
     notes.append("corrected.xml and `predict` are your model as it is: mend the torque column first")
     return Misread(
         findings=tuple(sorted(findings, key=lambda f: -f.evidence)),
         fit=Fit(rms, rms, rms, rms, floor),
-        corrected=Corrected(arm, jnp.zeros((arm.dof, 10)), zero, zero, (), ()),
+        corrected=Corrected.of(arm),
         source=source,
         notes=tuple(notes),
         knowledge=knowledge,
@@ -150,15 +101,12 @@ def _finding(names: Sequence[str], found: Meaning, arm: Any) -> Finding:
         effect="torque_meaning",
         joints=found.joints,
         recordings=tuple(names),
-        intervals=None,
         confidence=found.confidence,
-        alternatives=(),
         equation=EQUATIONS[found.kind],
         parameters=tuple(parameters),
         rms_torque=np.asarray(found.rms),
         evidence=found.evidence,
         summary=f"In {', '.join(names)}: {found.summary}",
-        terms=(),
         kind=found.kind,
     )
 

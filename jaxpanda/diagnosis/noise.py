@@ -16,6 +16,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
+from ..effects import SIGN_WIDTH
 from ..host import parallel
 from ..traces import Trace
 from .library import turning
@@ -29,8 +30,8 @@ QUIETEST = 1e-9
 """Noise is taken for at least this [N m]."""
 _RESOLVED = 1e-6
 """Share of a joint's torque for which its noise is taken at least: of squares 1e-16 is lost by rounding, so that
-beside less, as of a simulation without noise, a prior could not be told."""
-_RANK = 1e-6  # least singular value that counts, as a share of the largest
+beside less, as of a simulation without noise, a prior could not be told. And of a largest singular value that
+from which one counts."""
 _SHARES = (0.0, 0.001, 0.01, 0.1, 1.0)
 """Of the variance of what laws may be off from sample to sample, those that are told apart."""
 
@@ -114,7 +115,7 @@ class Saturation:
         rigid = Q[:, s > 1e-7 * s[0]]
         q, qd = stacked(lambda t: t.motion.q[:, joint]), stacked(lambda t: t.motion.qd[:, joint])
         load = stacked(lambda t: t.motion.load[:, joint])
-        sign = stacked(lambda t: t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / 0.01)))
+        sign = stacked(lambda t: t.down(np.tanh(np.asarray(t.channels.qd[:, joint]) / SIGN_WIDTH)))
         rates = [np.gradient(t.motion.load[:, joint], t.motion.dt) for t in traces]
         bends = [np.gradient(rate, t.motion.dt) for rate, t in zip(rates, traces, strict=True)]
         swings = np.stack([np.concatenate(rates), np.concatenate(bends)], 1)
@@ -215,7 +216,7 @@ class Saturation:
 
     def _of(self, joint: int, detail: float) -> _Basis:
         U, s, _ = np.linalg.svd(self.columns(joint, detail=detail), full_matrices=False)
-        U = U[:, s > _RANK * s[0]]
+        U = U[:, s > _RESOLVED * s[0]]
         return _Basis(detail, U, float(s[0]), self.moments(U), self._count(joint))
 
     def _coupled(self, joint: int, basis: _Basis) -> _Basis:
@@ -276,7 +277,7 @@ def _beside(basis: _Basis, E: Float[np.ndarray, "_rows _n"]) -> tuple[Float[np.n
     for _ in range(2):  # once would leave rounding of what is taken off
         E = E - U @ (U.T @ E)
     V, s, _ = np.linalg.svd(E, full_matrices=False)
-    return V[:, s > _RANK * largest], largest
+    return V[:, s > _RESOLVED * largest], largest
 
 
 def borne_out(

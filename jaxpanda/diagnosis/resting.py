@@ -22,19 +22,15 @@ and what the prediction uses is the user's own model.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.special
 from jaxtyping import Bool, Float
 
 from .. import summaries
-from ..arms import markup
 from ..arms.arm import Arm
-from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
 from ..effects import CATALOGUE, UNNAMED, AbstractEffect, LawAtRest, Levels, Motion, may_carry
@@ -42,9 +38,11 @@ from ..errors import InputError
 from ..recordings import Recording
 from ..report import Figure, Section, Table, number
 from ..traces import TRIM, Trace
-from . import saved
 from .finding import Finding, Fit
 from .knowledge import Knowledge, inertial_spread
+from .localise import ALARM
+from .saved import AbstractAsItIs
+from .unnamed import UNSURE
 
 YIELDS = 0.02
 """Travel below which an arm holds still [rad]: what gives way by milliradians under a force does not move."""
@@ -56,10 +54,6 @@ _FEWEST = 8
 """Blocks of which noise can be told."""
 _EVENTS = 4
 """Events in a recording, at most."""
-_CHANCE = 0.01
-"""Probability that noise makes an event of a recording, before anything is compared."""
-_UNSURE = 3.0
-"""How much larger than it seems a deviation of noise may be, times the root of how many means tell it."""
 _ABSOLUTE = 0.05
 """How well a level of torque is known beside noise, as a share of that."""
 _SIZES = 1.0, 0.2
@@ -100,62 +94,23 @@ class Level:
         return self.long / np.sqrt(np.sum(~self.event))
 
 
-@dataclasses.dataclass(frozen=True)
-class AtRest:
-    """What recordings of an arm at rest say; the same fields as `Diagnosis`, as far as they apply."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AtRest(AbstractAsItIs):
+    """What recordings of an arm at rest say."""
 
-    verdict: str
-    findings: tuple[Finding, ...]
-    fit: Fit
-    corrected: Corrected
-    """The user's model as it is."""
-    source: MjcfSource = dataclasses.field(repr=False)
-    notes: tuple[str, ...]
     levels: tuple[Level, ...] = dataclasses.field(repr=False)
-    knowledge: Knowledge
-    sources: tuple[Mapping[str, str], ...] = ()
-    replays: tuple[Mapping[str, Any], ...] = ()
 
     @property
-    def written(self) -> markup.Document:
-        return self.source.document
-
-    @property
-    def corrected_xml(self) -> str:
-        return self.written.text
-
-    def to_json(self) -> dict[str, Any]:
-        """diagnosis.json; null where something takes motion."""
-        return {
-            "schema": "jaxpanda.diagnosis/1",
-            "verdict": self.verdict,
-            "findings": [f.to_json() for f in self.findings],
-            "fit": self.fit.to_json(),
-            "notes": list(self.notes),
-            "localisation": None,
-            "heat_map": None,
-            "smallest_shown": [],
-            "next_experiment": None,
-            "replays": [],
-            "knowledge": self.knowledge,
-            "sources": [dict(one) for one in self.sources],
-            "log": [],
-        }
-
-    def lines(self) -> list[str]:
-        """Verdict and findings in plain sentences."""
-        sentence = (
-            "No joint moved, and torque at rest differs from the simulation's by more than friction can carry."
-            if self.findings
-            else "No joint moved, so that none was judged; what differs at rest is within noise, what the model's"
+    def opening(self) -> str:
+        if self.findings:
+            return (
+                "No joint moved, and torque at rest differs from the simulation's by more than friction can"
+                " carry."
+            )
+        return (
+            "No joint moved, so that none was judged; what differs at rest is within noise, what the model's"
             " numbers leave open, and the friction that may carry it."
         )
-        return [sentence, *(f"{f.summary} Confidence {f.confidence:.2f}." for f in self.findings)]
-
-    def save(self, folder: str | Path) -> tuple[str, ...]:
-        """Write diagnosis.json, corrected.xml and corrected.json."""
-        saved.write(self, folder)
-        return missing_assets(self.written, Path(folder))
 
 
 def rests(trace: Trace) -> bool:
@@ -215,7 +170,6 @@ def judge(
     before = np.concatenate([t.residual_at_rest for t in traces])
     rms = np.sqrt(np.mean(before**2, 0))
     floor = np.sqrt(np.mean(np.concatenate([_fast(t) for t in traces]) ** 2, 0))
-    zero = jnp.zeros(arm.dof)
     return AtRest(
         verdict="consistent"
         if not found
@@ -224,7 +178,7 @@ def judge(
         else "partly_explained",
         findings=tuple(found),
         fit=Fit(rms, rms, rms, rms, np.maximum(floor, 1e-9)),
-        corrected=Corrected(arm, jnp.zeros((arm.dof, 10)), zero, zero, (), ()),
+        corrected=Corrected.of(arm),
         source=source,
         notes=tuple(_notes(levels, arm, bool(found))),
         levels=levels,
@@ -269,7 +223,7 @@ def _long(mean: Float[np.ndarray, "blocks dof"], trace: Trace) -> Float[np.ndarr
     while m == 1 or 10 * m <= n:
         means = (sums[m:] - sums[:-m]) / m
         apart = np.median(np.abs(means[m:] - means[:-m]), axis=0) / 0.6745 / np.sqrt(2)
-        found.append(np.sqrt(m) * apart * (1 + _UNSURE * np.sqrt(m / n)))
+        found.append(np.sqrt(m) * apart * (1 + UNSURE * np.sqrt(m / n)))
         m *= 2
     return np.maximum(np.max(found, 0), least)
 
@@ -318,7 +272,7 @@ def _interval(level: Level, bound: Float[np.ndarray, " dof"]) -> np.ndarray | No
     beyond = np.maximum(np.abs(difference) - 2 * bound, 0) / level.long
     gain = share * np.sum(beyond**2, 1)
     best = int(np.argmax(gain))
-    x = np.log(n * n / (2 * _CHANCE))
+    x = np.log(n * n / (2 * ALARM))
     if (
         gain[best] < dof + 2 * np.sqrt(dof * x) + 2 * x
     ):  # chi squared (Laurent and Massart 2000), any interval
@@ -557,7 +511,6 @@ def _told(
         rms_torque=rms,
         evidence=evidence,
         summary=summary,
-        terms=(),
         own_family=effect.family,
     )
 

@@ -1,14 +1,18 @@
-"""The files that every diagnosis leaves, whatever it found."""
+"""What every diagnosis says and leaves in files, whatever it found."""
 
-from collections.abc import Mapping
+import abc
+import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from .. import files
 from ..arms import markup
-from ..arms.export import write_document
+from ..arms.export import missing_assets, write_document
+from ..arms.mjcf import MjcfSource
 from ..corrected import FILE, KIND, XML, Corrected
-from .finding import Fit
+from .finding import Finding, Fit
+from .knowledge import Knowledge
 
 
 @runtime_checkable
@@ -16,12 +20,86 @@ class Answer(Protocol):
     """What a diagnosis has in common with that of an arm at rest, or of torque that is none."""
 
     @property
-    def written(self) -> markup.Document: ...
+    def verdict(self) -> str: ...
+    @property
+    def findings(self) -> tuple[Finding, ...]: ...
+    @property
+    def fit(self) -> Fit: ...
     @property
     def corrected(self) -> Corrected: ...
     @property
-    def fit(self) -> Fit: ...
+    def written(self) -> markup.Document: ...
+    @property
+    def notes(self) -> tuple[str, ...]: ...
+    @property
+    def sources(self) -> tuple[Mapping[str, str], ...]: ...
+    @property
+    def replays(self) -> tuple[Mapping[str, Any], ...]: ...
     def to_json(self) -> dict[str, Any]: ...
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AbstractAsItIs(abc.ABC):
+    """A diagnosis that leaves the user's model as it is; fields as of `Diagnosis`, as far as they apply."""
+
+    verdict: str
+    findings: tuple[Finding, ...]
+    fit: Fit
+    """Of the user's model, before and after alike [N m]."""
+    corrected: Corrected
+    """The user's model as it is."""
+    source: MjcfSource = dataclasses.field(repr=False)
+    notes: tuple[str, ...]
+    knowledge: Knowledge
+    sources: tuple[Mapping[str, str], ...] = ()
+    replays: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    @abc.abstractmethod
+    def opening(self) -> str:
+        """The verdict as a sentence."""
+
+    @property
+    def written(self) -> markup.Document:
+        return self.source.document
+
+    def to_json(self) -> dict[str, Any]:
+        """diagnosis.json; null where something takes motion, or torque that is understood."""
+        return document(self, self.knowledge)
+
+    def lines(self) -> list[str]:
+        """Verdict and findings in plain sentences."""
+        return [self.opening, *sentences(self.findings)]
+
+    def save(self, folder: str | Path) -> tuple[str, ...]:
+        """Write diagnosis.json, corrected.xml and corrected.json."""
+        write(self, folder)
+        return missing_assets(self.written, Path(folder))
+
+
+def sentences(findings: Sequence[Finding]) -> list[str]:
+    """What was found, and how sure that is."""
+    return [f"{f.summary} Confidence {f.confidence:.2f}." for f in findings]
+
+
+def document(found: Answer, knowledge: Knowledge, **more: Any) -> dict[str, Any]:
+    """diagnosis.json; `more`: what other diagnoses do not have."""
+    return {
+        "schema": "jaxpanda.diagnosis/1",
+        "verdict": found.verdict,
+        "findings": [f.to_json() for f in found.findings],
+        "fit": found.fit.to_json(),
+        "notes": list(found.notes),
+        "localisation": None,
+        "heat_map": None,
+        "smallest_shown": [],
+        "next_experiment": None,
+        "replays": [dict(one) for one in found.replays],
+        "knowledge": knowledge,
+        "sources": [dict(one) for one in found.sources],
+        "log": [],
+        **more,
+    }
 
 
 def with_noise(corrected: Corrected, fit: Fit) -> dict[str, Any]:

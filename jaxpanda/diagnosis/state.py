@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Collection, Sequence
 
 import numpy as np
@@ -307,14 +306,6 @@ def _mean_square(left: Float[np.ndarray, " rows"]) -> float:
     return float(np.sum(left**2)) / max(np.count_nonzero(left), 1)
 
 
-def overlaps(state: State) -> list[tuple[int, int]]:
-    """Pairs of terms that act in a joint together."""
-    share = state.shares
-    pairs = itertools.combinations(range(len(share)), 2)
-    return [(i, k) for i, k in pairs if float(share[i] @ share[k]) > _TOGETHER]
-
-
-_TOGETHER = 0.02
 _LASTING, _LARGER = (0.5, 2.0), 2.0
 """Of slow errors: how long they last [s], and between their sizes that are told apart."""
 _STEP = 1.1

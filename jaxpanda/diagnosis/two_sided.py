@@ -11,7 +11,6 @@ sensors is taken off before.
 """
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,9 +33,6 @@ from . import saved
 from .diagnosis import Diagnosis
 from .finding import VERDICTS, Finding, Fit
 from .posterior import posterior_of_sides
-
-DRIVE = "drive"
-"""The family whose physics is in the drive, wherever its torque is seen."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,17 +67,13 @@ class TwoSided:
         return self.link.fit
 
     @property
-    def corrected_xml(self) -> str:
-        """Text of the corrected MJCF."""
-        return self.written.text
-
-    @functools.cached_property
     def findings(self) -> tuple[Finding, ...]:
         """Of both sides, those first that explain most torque over its noise."""
         sided = []
         for found, side in ((self.link, "link"), (self.drive, "drive")):
             for finding in found.findings:
-                here = "drive" if finding.family == DRIVE else side
+                # physics of the drive is in the drive, wherever its torque is seen
+                here = "drive" if finding.family == "drive" else side
                 size = float(np.sum(np.square(finding.rms_torque / found.fit.noise_floor)))
                 sided.append((size, dataclasses.replace(finding, side=here)))
         return tuple(finding for _, finding in sorted(sided, key=lambda one: -one[0]))
@@ -94,23 +86,13 @@ class TwoSided:
 
     def to_json(self) -> dict[str, Any]:
         """diagnosis.json; what belongs to one side stands in that side's own."""
-        return {
-            "schema": "jaxpanda.diagnosis/1",
-            "verdict": self.verdict,
-            "findings": [f.to_json() for f in self.findings],
-            "fit": self.fit.to_json(),
-            "fit_motor": self.drive.fit.to_json(),
-            "notes": list(self.notes),
-            "localisation": None,
-            "heat_map": None,
-            "smallest_shown": [],
-            "next_experiment": None,
-            "replays": [dict(one) for one in self.replays],
-            "knowledge": self.link.knowledge,
-            "sources": [dict(one) for one in self.sources],
-            "log": [*self.link.log, *self.drive.log],
-            "sides": {"link": self.link.to_json(), "drive": self.drive.to_json()},
-        }
+        return saved.document(
+            self,
+            self.link.knowledge,
+            fit_motor=self.drive.fit.to_json(),
+            log=[*self.link.log, *self.drive.log],
+            sides={"link": self.link.to_json(), "drive": self.drive.to_json()},
+        )
 
     def lines(self) -> list[str]:
         """Verdict and findings in plain sentences."""

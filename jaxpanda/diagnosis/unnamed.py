@@ -29,16 +29,14 @@ BEYOND = 4.0
 """Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""
 _COLOURED = 2.5
 """How much larger than its white part noise in the band may be."""
-_UNSURE = 3.0
-"""Deviations by which the noise's variance may be larger than it was estimated."""
+UNSURE = 3.0
+"""Deviations by which noise's variance may be larger than it was estimated, and what else is estimated."""
 _SMOOTHED, _PAUSE = 0.1, 0.3
 """Over which such an error is averaged, and a pause that does not end it [s]."""
 _LOWEST, _NEARBY = 5.0, 2.0
 """From where lines are looked for, and how far around them nothing else may be [Hz]."""
 _ALONE, _HEARD = 20.0, 0.5
 """By which factor a line's power exceeds any other there, and its rms over the noise's from which it counts."""
-_LACKS = 3.0
-"""Deviations of the friction that a model lacks which may be there."""
 _LOBE = 3
 """Bins on either side that a line takes under the window."""
 
@@ -64,7 +62,7 @@ def standing_off(problem: Problem, state: State, named: Collection[int]) -> list
     white = np.median([white_noise(t.signals.tau) for t in problem.traces if t.signals.tau is not None], 0)
     noise = np.minimum(state.noise.std, np.where(white > 0, _COLOURED * white, np.inf))  # 0: coarse steps
     free = np.array([problem.saturation.free(j) for j in joints])
-    noise = noise * np.sqrt(1 + _UNSURE * np.sqrt(2 / free))
+    noise = noise * np.sqrt(1 + UNSURE * np.sqrt(2 / free))
     weight = np.maximum(np.mean(weights**2, 0), 1e-9)
     beyond = np.mean((left / noise * weights) ** 2, 0) / weight
     # what is slow, as friction that holds a joint at rest somewhere, is beyond noise only if its changes are
@@ -111,15 +109,12 @@ def _standing_off(
         recordings=(trace.name,),
         intervals=None if whole else when,
         confidence=1 - 1 / beyond,
-        alternatives=(),
         equation="no law was found",
-        parameters=(),
         rms_torque=rms,
         evidence=float(0.5 * samples * (beyond - 1 - np.log(beyond))),
         foretold=0.0,
         summary=f"Joint {joint + 1} is {np.sqrt(beyond):.1f} times its noise off the simulation{at}; neither a"
         " named effect nor a free curve explains it.",
-        terms=(),
     )
 
 
@@ -141,11 +136,11 @@ def held_off(problem: Problem, state: State) -> Finding | None:
         arm, there = trace.motion.arm, trace.weight > 0
         friction = trace.residual_at_rest - trace.residual
         white = white_noise(trace.signals.tau) if trace.signals.tau is not None else np.zeros(arm.dof)
-        rubs = np.asarray(arm.frictionloss) + np.maximum(_LACKS * may_carry(arm), found)
+        rubs = np.asarray(arm.frictionloss) + np.maximum(UNSURE * may_carry(arm), found)
         for joint in np.flatnonzero(~trace.trust.any(0)).tolist():
             unsure = np.sqrt(np.sum(problem.nuisance[r][:, joint] ** 2, 1))
             off = (misfit(problem, state.terms, x, joint)[r] + friction[:, joint])[there]
-            may = (rubs[joint] + _COLOURED * white[joint] + _UNSURE * unsure)[there]
+            may = (rubs[joint] + _COLOURED * white[joint] + UNSURE * unsure)[there]
             times = float(np.mean(off**2) / np.mean(may**2))
             if times >= BEYOND and times > seen.get(joint, (0.0,))[0]:
                 seen[joint] = times, trace, off
@@ -159,17 +154,13 @@ def held_off(problem: Problem, state: State) -> Finding | None:
         effect=UNNAMED,
         joints=tuple(sorted(seen)),
         recordings=tuple(dict.fromkeys(trace.name for _, trace, _ in seen.values())),
-        intervals=None,
         confidence=1 - 1 / times,
-        alternatives=(),
         equation="no law was found",
-        parameters=(),
         rms_torque=rms,
         evidence=float(0.5 * len(off) * (times - 1 - np.log(times))),
         summary=f"Joint {clearest + 1} holds still throughout {trace.name}, and its torque is"
         f" {rms[clearest]:.3g} {problem.arm.unit('N·m', clearest)} rms off the simulation's,"
         f" {np.sqrt(times):.1f} times what friction at rest may carry.",
-        terms=(),
     )
 
 
@@ -195,16 +186,13 @@ def stuck(problem: Problem, std: Float[np.ndarray, " dof"]) -> Finding | None:
         recordings=(trace.name,),
         intervals=when,
         confidence=SUREST,
-        alternatives=(),
         equation="tau = constant",
-        parameters=(),
         rms_torque=rms,
         evidence=float(0.5 * np.sum((error / std) ** 2)),
         summary=f"The measured torque of joint{'s' * (len(joints) > 1)} "
         f"{', '.join(str(j + 1) for j in joints)} is stuck in {trace.name}, first from {when[0][0]:.2f} s to"
         f" {when[0][1]:.2f} s, while the arm moves: a sensor that repeats itself or is at its limit. What it gave"
         " then was not used.",
-        terms=(),
     )
 
 
@@ -243,9 +231,7 @@ def hum(
         effect=UNNAMED,
         joints=tuple(loudest),
         recordings=tuple(one.name for one, lines in same if lines),
-        intervals=None,
         confidence=1 - 1 / clearest.alone,
-        alternatives=(),
         equation="tau = amplitude * sin(2 pi frequency t + phase)",
         parameters=tuple(
             dict(zip(("name", "joint", "value", "std", "unit"), one, strict=True)) for one in told
@@ -255,7 +241,6 @@ def hum(
         summary=f"The measured torque of joint{'s' * (len(loudest) > 1)} "
         f"{', '.join(str(j + 1) for j in loudest)} hums at "
         f"{clearest.frequency:.2f} Hz whatever the arm does, with up to {np.sqrt(2) * rms.max():.2g} N·m.",
-        terms=(),
     )
 
 

@@ -30,6 +30,7 @@ from .motion import smooth_torque as smooth_torque
 from .still import LawAtRest as LawAtRest
 from .still import Levels as Levels
 from .still import may_carry as may_carry
+from .unknown import SIGN_WIDTH as SIGN_WIDTH
 
 CATALOGUE: tuple[type[AbstractEffect], ...] = (
     *friction.EFFECTS,
