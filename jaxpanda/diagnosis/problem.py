@@ -30,7 +30,7 @@ _UNHEARD = 1e9
 """Innovations of a joint that no recording tells anything about [N m]."""
 _PICKED = 64
 """Rows of a joint at rest that are looked at."""
-FOLDS, ROUNDS = 5, 5
+FOLDS = 5
 """Blocks of the cross-validation, and how often they come in a recording for what changes with time."""
 
 
@@ -54,8 +54,8 @@ class Term:
 
     @property
     def law(self) -> "Term":
-        """The law alone, believed to the last digit."""
-        return dataclasses.replace(self, discrepancy=(), unresolved=None, at_rest=None)
+        """The law alone; samples at which it may be off weigh as little as with its discrepancy."""
+        return dataclasses.replace(self, discrepancy=())
 
     @property
     def key(self) -> tuple[str, tuple[int, ...]]:
@@ -178,7 +178,7 @@ class Problem:
 
     @property
     def shaken(self) -> slice:
-        """Where the nuisance has the encoders' noise."""
+        """Where the nuisance has what was recorded otherwise than it was."""
         stop = self.nuisance[0].shape[2] - sum(len(t.deviation) for t in self.background)
         return slice(stop - self.traces[0].shaken.shape[2], stop)
 
@@ -415,7 +415,7 @@ class Problem:
     def spread_folds(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """The same in shorter blocks, each fold's all over the recording: of what changes with time, a long block
         left out is the only one that shows how it was then."""
-        return self._folds(ROUNDS)
+        return self._folds(FOLDS)
 
     def _folds(self, rounds: int = 1) -> list[tuple[np.ndarray, np.ndarray]]:
         splits = signals_.blocks_many([t.signals for t in self.traces], FOLDS, rounds=rounds)

@@ -5,12 +5,14 @@ of its effects. Steps add a term, drop one, put another or two in its place, or 
 of them knows an effect. What is left is a local optimum, and its neighbours, which `posterior` weighs.
 """
 
+import itertools
 from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 import scipy.special
 
+from ..effects import law_of
 from .alike import TEMPERATURE, joints_with, one_more, shared
 from .credible import fitted
 from .events import Proposal
@@ -25,7 +27,7 @@ from .state import (
     gains,
     in_noise,
     likelier,
-    overlaps,
+    paid,
     places,
     with_terms,
     without,
@@ -65,10 +67,13 @@ def laws(problem: Problem, log: list[str] | None = None, terms: Sequence[Term] =
     what is common in every joint.
     """
     say = _said(log)
-    state = climb(problem, with_terms(problem, terms), say, free=False)
+    first = with_terms(problem, terms)
+    state = climb(problem, first, say, free=False)
     if len(state.terms) >= _CROWDED:
-        say("another beginning: what is common, at all joints")
         common = with_terms(problem, everywhere(problem, state.noise))
+        if names(common) == names(first):  # which would lead to the same
+            return state
+        say("another beginning: what is common, at all joints")
         other = climb(problem, common, say, free=False, met=names(state))
         if names(other) != names(state):
             best = _likelier(problem, state, other, say)
@@ -264,15 +269,22 @@ def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> Sta
             continue
         found, barred = instead(problem, state, i, free)
         problem.tried.update(step.tried(free, barred, _told(found)))
-        own, best = next(gained for gained, terms in found if terms[0] is state.terms[i]), found[0]
-        if best[0] > own + BETTER:
-            other = with_terms(problem, (*state.terms[:i], *best[1], *state.terms[i + 1 :]))
-            if likelier((problem, state), (problem, other)) < 0:
-                continue
-            if [t.key for t in best[1]] != [state.terms[i].key]:
-                said = ", ".join(map(name, best[1]))
-                say(f"{said} for {name(state.terms[i])}: {best[0]:.1f} for {own:.1f}")
-            state = other
+        term = state.terms[i]
+        own = next(gained for gained, terms in found if terms[0] is term)
+        # what is hardly less likely may predict better what it was not fitted to
+        others = (c for c in found if [t.key for t in c[1]] != [term.key] and c[0] > own + UNLIKELY)
+        surely = found[0][0] > own + BETTER
+        best = found[0] if surely else next(others, None)
+        if best is None:
+            continue
+        other = with_terms(problem, (*state.terms[:i], *best[1], *state.terms[i + 1 :]))
+        if len(best[1]) > 1:
+            other = shaped_together(problem, other, range(i, i + len(best[1])))
+        if likelier((problem, state), (problem, other)) < (0.0 if surely else BETTER):
+            continue
+        if [t.key for t in best[1]] != [term.key]:
+            say(f"{', '.join(map(name, best[1]))} for {name(term)}: {best[0]:.1f} for {own:.1f}")
+        state = other
     return state
 
 
@@ -319,7 +331,8 @@ def merge(problem: Problem, state: State, say: Any, free: bool = True) -> State:
             tuple(i for i, t in enumerate(state.terms) if t.effect.joints == (j,)) for j in range(problem.dof)
         ]
         wide = [i for i, t in enumerate(state.terms) if not t.effect.one_joint]
-        pairs = [p for p in overlaps(state) if set(p) <= set(wide)]
+        share = state.shares
+        pairs = [(i, k) for i, k in itertools.combinations(wide, 2) if share[i] @ share[k] > _FELT]
         for group in dict.fromkeys((*(g for g in groups if len(g) > 1), *pairs)):
             step = Step(state, "merge", group)
             if step.key(free) in problem.tried:
@@ -383,19 +396,25 @@ def _parts(
     joints: Collection[int],
     free: bool,
 ) -> list[Choice]:
-    """What a law is a sum of, each part a term of its own: what is left of the law without what makes it one."""
-    if len(whole.effect.held) < 2:
+    """What a law is a sum of, each part a term of its own, and laws of the numbers that it corrects: what is left
+    of the law without what makes it one."""
+    corrected = [law_of(c.beyond) for c in whole.effect.coefficients if c.beyond]
+    if len(laws := [*whole.effect.held, *corrected]) < 2:
         return []
-    gained, parts = 0.0, ()
-    for part in whole.effect.held:
+    parts: tuple[Term, ...] = ()
+    for part in laws:
         terms = (*others, *parts)
         design = problem.design(terms, noise)
         of_kind = [p for p in ranked(problem, design, noise, joints) if p.effect.name == part.name]
         found = choices(problem, terms, design, noise, _new(terms, of_kind, free))
         if not found:
             return []
-        gained, parts = gained + found[0][0], (*parts, *found[0][1])
-    return [(gained, parts)]
+        parts = (*parts, *found[0][1])
+    rest = in_noise(problem, others, noise)
+    both = in_noise(problem, (*others, *parts), noise)
+    both = shaped_together(problem, both, range(len(others), len(both.terms)))
+    likely = [evidence(problem, s.terms, s.design, noise) + paid(s.terms, s.joints) for s in (rest, both)]
+    return [(likely[1] - likely[0], both.terms[len(others) :])]
 
 
 def _new(terms: Sequence[Term], proposals: Sequence[Proposal], free: bool) -> list[Proposal]:
@@ -420,7 +439,7 @@ def posterior(problem: Problem, state: State, i: int) -> dict[str, float]:
     else:
         found = _told(instead(problem, state, i)[0])
     weights = np.array([0.0, *(gained for gained, _ in found)]) / TEMPERATURE
-    shares_ = np.exp(weights - scipy.special.logsumexp(weights))
+    shares_ = scipy.special.softmax(weights)
     out: dict[str, float] = {}
     own = state.terms[i].effect.title
     for (_, titles), p in zip(found, shares_[1:], strict=True):
@@ -459,6 +478,13 @@ def settle(problem: Problem, state: State, count: int = 1) -> State:
         older = [i for i in range(len(share) - count) if share[i] @ share[newest] > _OVERLAP]
         for i in (newest, *older[::-1][: _SETTLED - 1]):
             state = reshaped(problem, state, i)
+    return state
+
+
+def shaped_together(problem: Problem, state: State, which: Collection[int]) -> State:
+    """The model with the shapes of some terms refined beside each other, which were each shaped without."""
+    for i in which:
+        state = reshaped(problem, state, i)
     return state
 
 
