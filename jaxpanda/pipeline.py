@@ -80,7 +80,11 @@ def inspect_files(
     if model is None and any(recording.dof != Arm.panda().dof for recording in recordings):
         return Inspections(tuple(inspect(recording) for recording in recordings))
     arm = arm_of(model, convention.mounting)
-    return Inspections(tuple(inspect(recording, arm) for recording in recordings))
+    each = tuple(inspect(recording, arm) for recording in recordings)
+    if model is None:
+        why = "no --model was given: signs, gravity and order are compared with the project's Panda's"
+        each = tuple(dataclasses.replace(one, notes=(why, *one.notes)) for one in each)
+    return Inspections(each)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -71,8 +71,8 @@ class Retrieval:
     active: tuple[str, ...]
     """Constraints that hold the solution back."""
     spread: Mapping[str, tuple[float, float]]
-    """Least and largest value of `m1`, `c1x`, `I1xx`, ... over the starts as good as the best: what the
-    coefficients cannot tell."""
+    """Least and largest value of `m1`, `c1x`, `I1xx`, ... over the starts as good as the best, and these links:
+    what the coefficients cannot tell."""
     as_good: int
     """How many starts those are."""
     starts: int
@@ -357,7 +357,7 @@ def retrieve(
         max_violation=violation,
         margins=margins,
         active=tuple(_active(margins, boxes)),
-        spread=_spread(found.phi, as_good),
+        spread=_spread(found.phi, as_good, phi),
         as_good=int(as_good.sum()),
         starts=starts,
         seed=seed,
@@ -661,11 +661,13 @@ def _described(
 
 
 def _spread(
-    phi: Float[np.ndarray, "starts dof 10"], chosen: Bool[np.ndarray, " starts"]
+    phi: Float[np.ndarray, "starts dof 10"],
+    chosen: Bool[np.ndarray, " starts"],
+    links: Float[np.ndarray, "dof 10"],
 ) -> dict[str, tuple[float, float]]:
-    """Over the chosen starts, in blocks of one size, which bounds the memory and compiles once."""
+    """Over these links and the chosen starts, in blocks of one size: that bounds memory, and compiles once."""
     numbers = np.flatnonzero(chosen)
-    blocks = []
+    blocks = [_extremes(links[None])]
     for first in range(0, len(numbers), _BLOCK):
         here = np.minimum(np.arange(first, first + _BLOCK), len(numbers) - 1)
         blocks.append(_extremes(phi[numbers[here]]))

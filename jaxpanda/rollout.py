@@ -169,16 +169,22 @@ def replay(
 
 
 def compare(
-    corrected: Corrected, source: MjcfSource, recording: Recording, *, seconds: float = SECONDS
+    corrected: Corrected, source: Model | MjcfSource, recording: Recording, *, seconds: float = SECONDS
 ) -> dict[str, Any]:
     """The user's simulation and the corrected one replay a recording in C MuJoCo, under the same feedback.
+
+    Args:
+        corrected: the corrected arm.
+        source: MJCF of the arm as the user has it.
+        recording: with torque.
+        seconds: length, at most.
 
     Returns:
         Numbers a joint, before and after: `rmse_rad_…`, `rmse_rad_per_s_…`, `feedback_rms_…` [N m]; null where
         a simulation ran away. With them the recording, the window [s] and the gains.
     """
     require_x64("a replay")
-    arm = corrected.arm
+    arm, source = corrected.arm, source if isinstance(source, MjcfSource) else from_mjcf(source)[1]
     plants = [Plant.of(arm, arm, ()), corrected.plant(_called(corrected, recording))]
     gains, start = make_gains(recording, corrected.arm), _begin(plants[1], seconds)
     for plant in plants:
@@ -222,11 +228,12 @@ def _called(corrected: Corrected, recording: Recording) -> str:
 
 
 @own_log()
-def engine_model(source: MjcfSource, arm: Arm) -> mujoco.MjModel:
+def engine_model(source: Model | MjcfSource, arm: Arm) -> mujoco.MjModel:
     """The arm of a file, stripped for a roll-out, with the numbers of `arm` in it.
 
     Integrated by `implicitfast`, which both engines have and which takes damping implicitly.
     """
+    source = source if isinstance(source, MjcfSource) else from_mjcf(source)[1]
     bare = arm_model(source)
     off = mujoco.mjtDisableBit
     bare.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST

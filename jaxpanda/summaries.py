@@ -98,7 +98,8 @@ def retrieval(links: Any) -> Sequence[Section]:
     best = document["objective"]
     sentences = [
         *_explained(document),
-        f"The best of {document['starts']} random starts misses the coefficients by phi = {best:.6g}"
+        f"Chosen among what {document['starts']} random starts led to, these links miss the coefficients by "
+        f"phi = {best:.6g}"
         f"{' (weighed by torque, in variances of a sample)' if document['weighting'] == 'torque' else ''}; "
         f"largest violation of any constraint {document['max_violation']:.2g}; "
         f"total mass {document['total_mass']:.2f} kg.",
@@ -140,7 +141,11 @@ def retrieval(links: Any) -> Sequence[Section]:
                     rows,
                     "In each link's modified Denavit-Hartenberg frame; inertia about the com [kg m²]",
                 ),
-                Table(["mass", "least kg", "most kg"], open_, "Over the starts that are as good as the best"),
+                Table(
+                    ["mass", "least kg", "most kg"],
+                    open_,
+                    "Over these links and the starts that are as good as the best",
+                ),
                 *_errors(document),
             ],
             figures,
@@ -374,6 +379,7 @@ def excitation(found: Any) -> Sequence[Section]:
     """What the motion tells, what it takes of the limits, and the files."""
     document = found.to_json()
     conditions, check, names = document["condition_number"], document["check"], document["joints"]
+    unit = found.arm.unit
     sentences = [
         f"A periodic motion of {found.seconds:g} s from rest to rest; condition number of the regressor "
         f"{number(conditions['base'], 3)}, with friction columns {number(conditions['with_friction'], 3)} "
@@ -412,7 +418,9 @@ def excitation(found: Any) -> Sequence[Section]:
             rows,
             "Standard deviation that a recording would give [kg m², kg m]",
         ),
-        by_joint("The same of friction [N m s/rad, N m, N m]", names, friction),
+        by_joint(
+            f"The same of friction [{unit('N m s/rad')}, {unit('N m')}, {unit('N m')}]", names, friction
+        ),
     ]
     sentences.append(f"Files: {', '.join(document['files'])}.")
     return [Section("Excitation", [*sentences, *document["notes"]], tables)]
@@ -420,7 +428,7 @@ def excitation(found: Any) -> Sequence[Section]:
 
 def ensemble(found: Any) -> Sequence[Section]:
     """How members differ, and whether the chains that they were drawn by agree."""
-    document = found.to_json()
+    document, unit = found.to_json(), found.arm.unit
     mixing, total = document["mixing"], document["total_mass"]
     between = lambda low, middle, high: f"{middle:.4g} ({low:.4g} to {high:.4g})"
     sentences = [
@@ -437,7 +445,9 @@ def ensemble(found: Any) -> Sequence[Section]:
     tables = [Table(["link", "m kg", "cx m", "cy m", "cz m"], rows, "Links: what the recordings leave open")]
     if kinds:
         rows = [[joint["name"], *(between(*joint[kind]) for kind in kinds)] for joint in document["joints"]]
-        tables.append(Table(["joint", *kinds], rows, "Friction beyond the model [N m s/rad, N m]"))
+        tables.append(
+            Table(["joint", *kinds], rows, f"Friction beyond the model [{unit('N m s/rad')}, {unit('N m')}]")
+        )
     return [Section("Ensemble", [*sentences, *document["notes"]], tables)]
 
 

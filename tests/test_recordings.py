@@ -8,6 +8,7 @@ import pytest
 
 from jaxpanda.errors import InputError, MissingExtraError
 from jaxpanda.recordings import Recording, distinct, load, load_many, save
+from jaxpanda.recordings.checks import checked
 from jaxpanda.recordings.ticks import consistent, reconstruct
 
 
@@ -44,6 +45,18 @@ def text(cells: list[list[str]]) -> str:
 def same(a: Recording, b: Recording) -> bool:
     pairs = zip([a.time, *a.channels()], [b.time, *b.channels()], strict=True)
     return all(np.array_equal(x, y) for x, y in pairs)
+
+
+def test_positions_in_each_other_s_place_are_told_by_their_velocities():
+    """Swapped columns of q had been taken for another mounting, at 0.99."""
+    right = recording()
+    swapped = dataclasses.replace(right, q=right.q[:, [0, 2, 1]])
+    with pytest.raises(InputError, match=r"dq_2 is d\(q_3\)/dt, dq_3 is d\(q_2\)/dt: .*--columns"):
+        checked(swapped)
+    together = np.tile(motion(right.time)[:, :1], 3)  # all joints move alike: nothing tells them apart
+    alike = dataclasses.replace(right, q=together, qd=np.tile(velocity(right.time)[:, :1], 3))
+    assert checked(alike).samples == right.samples
+    assert checked(dataclasses.replace(right, qd=-right.qd)).samples == right.samples
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".npz", ".parquet"])

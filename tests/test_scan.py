@@ -162,6 +162,20 @@ def test_laws_that_oppose_each_other_are_refused(problem: Problem, monkeypatch):
     assert gained > 100.0
 
 
+def test_what_cannot_be_gives_way_to_what_comes_after_it(problem: Problem, monkeypatch):
+    """Bristles that damped themselves negatively came first at each joint, so that nothing was added at any:
+    Stribeck's friction of four of six joints was not found."""
+    noise, size = problem.noise(()), np.array([0.3, 0.3])
+    first, second = (TorqueRipple(joint, 33.7, "one") for joint in (3, 1))
+    proposals = [
+        Proposal(law, evidence, evidence, size, ()) for law, evidence in ((first, 500.0), (second, 5.0))
+    ]
+    chosen = lambda: search.choices(problem, (), problem.design((), noise), noise, proposals)
+    assert {term.effect.joints for _, (term,) in chosen()} == {(3,)}  # the other is far less likely
+    monkeypatch.setattr(search, "is_possible", lambda term, _: term.effect.joints != (3,))
+    assert {term.effect.joints for _, (term,) in chosen()} == {(1,)}
+
+
 def test_what_a_model_explains_of_a_joints_candidates_takes_its_coefficients_there_alone(problem: Problem):
     terms = [problem.term(CoulombFriction(j, 0.01), np.array([0.3])) for j in (1, 3)]
     design = problem.design(terms, problem.noise(terms))

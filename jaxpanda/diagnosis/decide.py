@@ -337,7 +337,8 @@ def _summary(name, joints, rms, intervals, recordings, alternatives, problem, ow
     opening, closing = f"The simulation is missing {name.replace('_', ' ')}", ""
     if {at for _, at, *_ in numbers} == set(joints):
         opening, closing = _wrong_number(numbers, strongest)
-    text = f"{opening}{where}{when}: up to {size}, at joint {strongest + 1}{closing}."
+    most = size if joints == (strongest,) else f"up to {size}, at joint {strongest + 1}"
+    text = f"{opening}{where}{when}: {most}{closing}."
     if alternatives and own < 0.9:
         rival = alternatives[0][0]
         cls = next(c for c in problem.catalogue if c.name == name)

@@ -660,10 +660,9 @@ def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
     rows, shades, arm = [], [], found.problem.arm
     for effect in dict.fromkeys(one.effect for one in found.least_shown):
         cells = {one.joint: one for one in found.least_shown if one.effect == effect}
-        first = next(iter(cells.values()))
         whole = cells.get(None)
-        units = " or ".join(dict.fromkeys(one.unit for one in cells.values()))
-        row = [f"{_plain(effect)}\n{first.parameter} [{units}]"]
+        sizes = list(dict.fromkeys(f"{one.parameter} [{one.unit}]" for one in cells.values()))
+        row = [f"{_plain(effect)}\n{' or '.join(sizes)}"]
         shade: list[float | None] = [None]
         for j in range(len(names)):
             one = whole if whole is not None else cells.get(j)
@@ -674,7 +673,8 @@ def _exclusion(found: Diagnosis, names: Sequence[str]) -> Section:
             row.append(
                 "not seen"
                 if one.size is None or one.rms_torque is None
-                else f"{number(one.size, 2)}\n{number(one.rms_torque, 2)} {arm.unit('N·m', one.joint)}"
+                else f"{number(one.size, 2)}{f' {one.unit}' if len(sizes) > 1 else ''}\n"
+                f"{number(one.rms_torque, 2)} {arm.unit('N·m', one.joint)}"
             )
             shade.append(-0.5 if one.size is None else -0.35 * (one.survives < 0.05) or None)
         rows.append(row)

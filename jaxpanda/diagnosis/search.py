@@ -161,7 +161,11 @@ def choices(
         return []
     laws, out = [t.effect for t in terms], []
     own = evidence(problem, terms, design, noise) + shared(laws, problem.telling)
-    for p in _likeliest(proposals):
+    counted: list[Proposal] = []
+    for p in proposals:
+        if not _is_weighed(p, counted):
+            break
+        possible = False
         for form in (p, *plainer(problem, design, noise, p)):
             term = taken(problem, design, noise, form)
             more = problem.design((*terms, term), noise)
@@ -169,14 +173,17 @@ def choices(
                 found = evidence(problem, (*terms, term), more, noise)
                 paid = term.prior + shared((*laws, term.effect), problem.telling)
                 out.append((found - own + paid, (term,)))
+                possible = True
             problem.forget(term)
+        if possible:  # what cannot be gives way to what comes after it
+            counted.append(p)
     return sorted(out, key=lambda choice: -choice[0])
 
 
-def _likeliest(proposals: Sequence[Proposal]) -> list[Proposal]:
-    """Those that are weighed."""
-    best = max((p.evidence for p in proposals[:1]), default=0.0)
-    return [p for p in proposals if p.evidence > (_WINDOW * best if best > 0 else UNLIKELY)][:_TRIED]
+def _is_weighed(proposal: Proposal, before: Sequence[Proposal]) -> bool:
+    """Whether a proposal is weighed, after the likelier ones."""
+    best = max((p.evidence for p in before[:1]), default=0.0)
+    return len(before) < _TRIED and proposal.evidence > (_WINDOW * best if best > 0 else UNLIKELY)
 
 
 def is_possible(term: Term, design: Design) -> bool:
@@ -385,7 +392,8 @@ def instead(problem: Problem, state: State, i: int, free: bool = True) -> tuple[
 
 def _lets_free_in(terms: Sequence[Term], proposals: Sequence[Proposal]) -> bool:
     """Whether free forms are among what is weighed of these."""
-    return any(p.effect.free for p in _likeliest(_new(terms, proposals, free=True)))
+    let_in = _new(terms, proposals, free=True)
+    return any(p.effect.free and _is_weighed(p, let_in[:k]) for k, p in enumerate(let_in))
 
 
 def _parts(

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from ..errors import InputError
 from .clock import on_clock
@@ -30,6 +30,8 @@ _APART = 3.0
 """How many times faster than the rows beside it."""
 _EMPTY = 50.0
 """How many times as many samples as there are rows may be missing from a recording."""
+_UNLIKE, _ALIKE = 0.5, 0.9
+"""Correlations of dq with d(q)/dt below which it is not that joint's, and from which it is another's."""
 _TRAVELS = 0.5
 """How far a joint moves that says which unit positions are in [rad]."""
 _FASTEST = 10.0
@@ -77,6 +79,7 @@ def plausible(recording: Recording) -> Recording:
 def _units(recording: Recording) -> None:
     _radians(recording)
     _newton_metres(recording)
+    _same_order(recording)
     _velocity_unit(recording)
 
 
@@ -256,8 +259,41 @@ def _velocity_unit(recording: Recording) -> None:
             )
 
 
+def _same_order(recording: Recording) -> None:
+    """dq of a joint that is d(q)/dt of another, and that one's of this or a third: q or dq is out of order."""
+    if (pair := _slopes(recording)) is None:
+        return
+    least = np.finfo(float).tiny
+    pair = tuple(x / np.maximum(np.abs(x).max(0), least) for x in pair)  # squares may overflow
+    slope, qd = (x / np.maximum(np.linalg.norm(x, axis=0), least) for x in pair)
+    alike = qd.T @ slope
+    other = np.argmax(alike, 1)
+    moved = np.flatnonzero(other != np.arange(recording.dof))
+    moved = moved[(np.diag(alike)[moved] < _UNLIKE) & (alike[moved, other[moved]] > _ALIKE)]
+    if len(moved) and set(moved) == set(other[moved]):
+        each = ", ".join(f"dq_{i + 1} is d(q_{other[i] + 1})/dt" for i in moved)
+        raise InputError(
+            f"{recording.name}: {each}: columns of q or of dq are in each other's place: write them in "
+            "the order of the joints, or say which are which (--columns)"
+        )
+
+
 def velocity_scale(recording: Recording) -> float | None:
     """k of the least-squares fit dq = k d(q)/dt over 20 ms; None where it explains little."""
+    if (pair := _slopes(recording)) is None:
+        return None
+    slope, qd = pair
+    sizes = float(np.abs(slope).max()), float(np.abs(qd).max())
+    slope, qd = slope / sizes[0], qd / sizes[1]  # squares of what some files hold overflow
+    k = np.sum(slope * qd) / np.sum(slope**2) * (sizes[1] / sizes[0])
+    correlation = np.sum(slope * qd) / np.sqrt(np.sum(slope**2) * np.sum(qd**2))
+    return float(k) if abs(correlation) > 0.8 else None
+
+
+def _slopes(
+    recording: Recording,
+) -> tuple[Float[np.ndarray, "rows dof"], Float[np.ndarray, "rows dof"]] | None:
+    """d(q)/dt over 20 ms and dq there; None where either is all zero, or the recording too short."""
     if recording.qd is None:
         return None
     half = max(1, round(0.01 / float(np.median(np.diff(recording.time)))))
@@ -266,10 +302,4 @@ def velocity_scale(recording: Recording) -> float | None:
     dt = recording.time[2 * half :] - recording.time[: -2 * half]
     slope = (recording.q[2 * half :] - recording.q[: -2 * half]) / dt[:, None]
     qd = recording.qd[half:-half]
-    if not (np.any(slope) and np.any(qd)):
-        return None
-    sizes = float(np.abs(slope).max()), float(np.abs(qd).max())
-    slope, qd = slope / sizes[0], qd / sizes[1]  # squares of what some files hold overflow
-    k = np.sum(slope * qd) / np.sum(slope**2) * (sizes[1] / sizes[0])
-    correlation = np.sum(slope * qd) / np.sqrt(np.sum(slope**2) * np.sum(qd**2))
-    return float(k) if abs(correlation) > 0.8 else None
+    return (slope, qd) if np.any(slope) and np.any(qd) else None
