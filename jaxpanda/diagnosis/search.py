@@ -171,8 +171,8 @@ def choices(
             more = problem.design((*terms, term), noise)
             if is_possible(term, more) and not is_opposed(problem, term, more):
                 found = evidence(problem, (*terms, term), more, noise)
-                paid = term.prior + shared((*laws, term.effect), problem.telling)
-                out.append((found - own + paid, (term,)))
+                odds = term.prior + shared((*laws, term.effect), problem.telling)
+                out.append((found - own + odds, (term,)))
                 possible = True
             problem.forget(term)
         if possible:  # what cannot be gives way to what comes after it
