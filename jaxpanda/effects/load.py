@@ -79,6 +79,11 @@ def body_at_rest(levels: Levels, odds: float, *, positive: bool = False, told_by
     return LawAtRest(columns * deviations, odds, link, names, positive, told_by)
 
 
+def _in(link: int) -> str:
+    """The frame that a body's parameters are in, in words."""
+    return f", in the modified Denavit-Hartenberg frame of link {link + 1}, inertia about its origin"
+
+
 class InertialParameters(AbstractArmEffect):
     r"""Mass, centre of mass or inertia of a link differ from the model: $\tau = Y_i\,\Delta\phi_i$.
 
@@ -123,7 +128,9 @@ class InertialParameters(AbstractArmEffect):
 
     @property
     def equation(self) -> str:
-        return f"tau = Y_{self.link + 1}(q, dq, ddq) * (change of link {self.link + 1}'s ten inertial parameters)"
+        return (
+            f"tau = Y_{self.link + 1}(q, dq, ddq) * (change of its ten inertial parameters{_in(self.link)})"
+        )
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         return motion.regressor[:, :, 10 * self.link : 10 * self.link + 10] @ self._basis[0]
@@ -177,7 +184,9 @@ class Payload(AbstractArmEffect):
 
     @property
     def equation(self) -> str:
-        return f"tau = Y_{self.link + 1}(q, dq, ddq) * (ten inertial parameters of the payload)"
+        return (
+            f"tau = Y_{self.link + 1}(q, dq, ddq) * (ten inertial parameters of the payload{_in(self.link)})"
+        )
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         return motion.regressor[:, :, 10 * self.link : 10 * self.link + 10] @ self._basis[0]
@@ -286,7 +295,7 @@ class PayloadChange(AbstractArmEffect):
     @property
     def equation(self) -> str:
         when = {"gained": "t >= start", "lost": "t < stop", "carried": "start <= t < stop"}[self.form]
-        return f"tau = Y_{self.link + 1}(q, dq, ddq) * (ten inertial parameters of the body) while {when}"
+        return f"tau = Y_{self.link + 1}(q, dq, ddq) * (ten inertial parameters of the body{_in(self.link)}) while {when}"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         columns = motion.regressor[:, :, 10 * self.link : 10 * self.link + 10] @ self._basis[0]
