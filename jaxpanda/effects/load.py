@@ -295,7 +295,8 @@ class PayloadChange(AbstractArmEffect):
     @property
     def equation(self) -> str:
         when = {"gained": "t >= start", "lost": "t < stop", "carried": "start <= t < stop"}[self.form]
-        return f"tau = Y_{self.link + 1}(q, dq, ddq) * (ten inertial parameters of the body{_in(self.link)}) while {when}"
+        body = f"ten inertial parameters of the body{_in(self.link)}"
+        return f"tau = Y_{self.link + 1}(q, dq, ddq) * ({body}) while {when}"
 
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         columns = motion.regressor[:, :, 10 * self.link : 10 * self.link + 10] @ self._basis[0]
