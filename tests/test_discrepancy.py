@@ -197,6 +197,7 @@ def test_a_term_s_law_has_no_columns_of_a_discrepancy_and_trusts_no_more_samples
     assert law.unresolved is term.unresolved
     assert law.at_rest is term.at_rest
     assert term.unresolved is not None
+    assert (term.exact.discrepancy, term.exact.unresolved, term.exact.at_rest) == ((), None, None)
     assert law.effect is term.effect
     assert law.columns is term.columns
     assert law.prior == term.prior

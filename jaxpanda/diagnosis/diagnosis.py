@@ -184,7 +184,7 @@ def sought(
     problem = premises.problem
     progress("refining the numbers, and weighing what else it could be")
     state = polished(problem, searched)
-    laws = polished(problem, with_terms(problem, [t.law for t in state.terms]))
+    laws = _fitted_laws(problem, state)
     guessed = premises.knowledge not in ("exact", "identified")
     moved = numbers(problem, state, premises.changes) if guessed else []
     # within what is known of them, or by an identification with a poorer motion, they are no finding; nor are
@@ -268,6 +268,22 @@ def sought(
     )
     # numbers that moved by less than torque shows stay as the user wrote them
     return made, corrected if moved else corrected.as_written
+
+
+def _fitted_laws(problem: Problem, state: State) -> State:
+    """The laws of a model without discrepancy. Samples where a law may be off count as little as beside it, or in
+    full: at each joint as torque is predicted better that nothing was fitted to. Bristles have a law for where a
+    joint turns back; Coulomb's friction, which sticks there, has none."""
+    each = [t.law for t in state.terms], [t.exact for t in state.terms]
+    ways = [polished(problem, with_terms(problem, terms)) for terms in each]
+    spread = any(t.effect.drifts for t in state.terms)
+    left = [problem.predicted_error(s.design, ways[0].noise, spread=spread)[0] for s in ways]
+    better = left[1] < left[0]
+    which = [bool(np.all(better[t.acts])) for t in state.terms]
+    if len(set(which)) < 2:
+        return ways[bool(which) and which[0]]
+    terms = [pair[k] for k, *pair in zip(which, ways[0].terms, ways[1].terms, strict=True)]
+    return polished(problem, with_terms(problem, terms))
 
 
 def _refitted(arm: Arm, moved: Sequence[Finding], why: str) -> str:

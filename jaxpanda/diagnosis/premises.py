@@ -95,7 +95,7 @@ def settled(
         log.append("healthy recordings alone")
         premises, state = settled(healthy, (True,) * len(healthy), knowledge, log, scale, catalogue)
         knowledge, scale, notes = premises.knowledge, premises.scale, premises.notes
-        background = tuple(t.law for t in state.terms if not t.effect.bound_to_recording)
+        background = tuple(t.exact for t in state.terms if not t.effect.bound_to_recording)
         kept = transferable(premises.problem, with_terms(premises.problem, background))
         lasting = tuple(any(t is k for k in kept.terms) for t in background)
         log.append("suspect recordings beside them")

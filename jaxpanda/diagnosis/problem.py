@@ -58,6 +58,11 @@ class Term:
         return dataclasses.replace(self, discrepancy=())
 
     @property
+    def exact(self) -> "Term":
+        """The law alone, believed to the last digit."""
+        return dataclasses.replace(self, discrepancy=(), unresolved=None, at_rest=None)
+
+    @property
     def key(self) -> tuple[str, tuple[int, ...]]:
         """Name and joints: what makes two terms the same finding."""
         return self.effect.name, self.effect.joints
