@@ -279,7 +279,7 @@ def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> Sta
         term = state.terms[i]
         own = next(gained for gained, terms in found if terms[0] is term)
         # what is hardly less likely may predict better what it was not fitted to
-        others = (c for c in found if [t.key for t in c[1]] != [term.key] and c[0] > own + UNLIKELY)
+        others = (c for c in found if all(t.key != term.key for t in c[1]) and c[0] > own + UNLIKELY)
         surely = found[0][0] > own + BETTER
         best = found[0] if surely else next(others, None)
         if best is None:
