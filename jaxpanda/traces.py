@@ -100,6 +100,8 @@ class Trace:
     """What a sample weighs in each joint, 0 to 1: less where nothing tells which way known friction points, and
     where the motion is sharper than the filter of q lets through or its positions jump; none where the joint
     never moves, as friction at rest may carry any part of its load, and none where its torque is stuck."""
+    sharp: bool = False
+    """Whether its torque shows faster motion than the noise of q lets through."""
     unsure: Float[np.ndarray, "time dof"] | None = None
     """1 where the sign of a joint's velocity cannot be told, else 0: friction at rest may carry any load."""
     stuck: tuple[tuple[int, float, float], ...] = ()
@@ -140,15 +142,15 @@ class Trace:
         r"""What was recorded otherwise than it was may have put into the nominal torque, by its deviations.
 
         Noise of the encoders, in the bands where it is most of $\ddot q$: $M_{\cdot k}(q)$ times joint k's
-        acceleration in each. And that position and torque of a row were taken at instants of their own, some
-        part of a row apart, or a torque that jumps at the instant of a row: $\dot\tau$ times that time.
+        acceleration in each. And in a sharp motion that position and torque of a row were taken some part of
+        a row apart, or torque jumped at the instant of a row: $\dot\tau$ times that time.
         """
         qdd, rate = self.motion.qdd, 1 / self.motion.dt
         below = [signals_.zero_phase(qdd, cutoff, rate) for cutoff in _SHAKEN if cutoff < 0.45 * rate]
         bands = [high - low for low, high in itertools.pairwise([*below, qdd])]
         apart = np.gradient(self.motion.load, self.motion.dt, axis=0) / self.signals.rate
         noise = [_NOISE_SHARE * self.motion.mass * band[:, None] for band in bands]
-        return np.concatenate([*noise, _APART * apart[:, :, None]], 2)
+        return np.concatenate([*noise, self.sharp * _APART * apart[:, :, None]], 2)
 
     def showing(self, friction: Float[Array | np.ndarray, "2 dof"] | None) -> "Trace":
         """The same, where recordings show so much more friction than the model has: viscous [N m s/rad] and
@@ -255,14 +257,14 @@ def prepare(recording: Recording, arm: Arm, *, coarse: float = WORK_RATE) -> Tra
     position = _splined(recording, time)
     noise = None if rough.tau is None else signals_.white_noise(rough.tau)
     most = min(_FELT * coarse, 0.4 * rate)
-    cutoff_q = min(position_cutoff(position, noise, arm, rate), most)
+    cutoff_q = least = min(position_cutoff(position, noise, arm, rate), most)
     if noise is not None:
-        cutoff_q = _cutoff_shown(recording, rough, position, arm, cutoff_q, most)
+        cutoff_q = _cutoff_shown(recording, rough, position, arm, least, most)
     q, qd, qdd = continued_derivatives(position, cutoff_q, rate)
     pretended = _pretended(position, _written_in(recording), cutoff_q, rate)
     trace = _on_grids(recording, rough, keep, (q, qd, qdd), pretended, arm, (), coarse)
     doubtful = _unsure_sign(position, qd, pretended[0] + _TURN * np.abs(qdd), cutoff_q, rate)[keep]
-    trace = dataclasses.replace(trace, unsure=doubtful)
+    trace = dataclasses.replace(trace, unsure=doubtful, sharp=cutoff_q > least)
     if noise is None:
         return trace
     motion = trace.motion
