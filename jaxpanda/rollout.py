@@ -184,7 +184,7 @@ def compare(
         a simulation ran away. With them the recording, the window [s] and the gains.
     """
     require_x64("a replay")
-    arm, source = corrected.arm, source if isinstance(source, MjcfSource) else from_mjcf(source)[1]
+    arm, source = corrected.arm, _source(source)
     plants = [Plant.of(arm, arm, ()), corrected.plant(_called(corrected, recording))]
     gains, start = make_gains(recording, corrected.arm), _begin(plants[1], seconds)
     for plant in plants:
@@ -233,7 +233,7 @@ def engine_model(source: Model | MjcfSource, arm: Arm) -> mujoco.MjModel:
 
     Integrated by `implicitfast`, which both engines have and which takes damping implicitly.
     """
-    source = source if isinstance(source, MjcfSource) else from_mjcf(source)[1]
+    source = _source(source)
     bare = arm_model(source)
     off = mujoco.mjtDisableBit
     bare.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -346,7 +346,11 @@ def _opened(
     else:
         corrected = read(diagnosis, effects)[0]
         model = file_with(corrected.arm, Path(diagnosis) / XML) if model is None else model
-    return corrected, model if isinstance(model, MjcfSource) else from_mjcf(model)[1]
+    return corrected, _source(model)
+
+
+def _source(model: Model | MjcfSource) -> MjcfSource:
+    return model if isinstance(model, MjcfSource) else from_mjcf(model)[1]
 
 
 def control(

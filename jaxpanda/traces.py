@@ -36,7 +36,7 @@ POSITION_CUTOFF = 12.0
 """Low-pass of q before it is differentiated, at most, where the torque shows no faster motion [Hz]."""
 _LEAST_CUTOFF = 5.0
 """The least low-pass of q [Hz]."""
-_PIECE = 2.0
+PIECE = 2.0
 """Of a recording, about as long as a motion between two rests [s]."""
 TRIM = 0.4
 """Left out at both ends of a recording [s]."""
@@ -591,7 +591,7 @@ def _cutoff_shown(
     while cutoffs[-1] < most:
         cutoffs.append(min(cutoffs[-1] * RATIO, most))
     counts = _weight(recording.time, time, signals.rate) > 0
-    pieces = np.array_split(np.flatnonzero(counts), max(2, round(float(time[-1] - time[0]) / _PIECE)))
+    pieces = np.array_split(np.flatnonzero(counts), max(2, round(float(time[-1] - time[0]) / PIECE)))
     floor = np.maximum(signals_.white_noise(tau), 1e-12)
     left = []
     for cutoff in cutoffs:

@@ -16,15 +16,13 @@ from jaxtyping import Float
 
 from ..corrected import Corrected, Recorded
 from ..effects import Turn
-from ..traces import Trajectory, trajectory
+from ..traces import PIECE, Trajectory, trajectory
 from .predict import predicted
 
 TURNS = (Turn("speed", 0.01), *(Turn("distance", x) for x in (3e-4, 7e-4, 1.5e-3, 3e-3, 6e-3)))
 """How friction of a gear may turn [rad/s, rad]."""
 CUTOFFS = (40.0, 30.0, 24.0, 20.0, 17.0, 14.0, 12.0, 10.0, 8.5, 7.0, 6.0, 5.0)
 """Low-passes of the motion that are tried [Hz]."""
-PIECE = 2.0
-"""Of a recording, about as long as a motion between two rests [s]."""
 LONG = 120.0
 """What of a recording is compared, from its start, at most [s]: more says the same again."""
 MOST = 0.5
