@@ -612,7 +612,7 @@ def _torque_errors(
     """
     K = table.projection
     beta = K @ phi.ravel()
-    left = whole.residual(beta, own_parameters(friction, whole.dof))
+    left = whole.error(beta, own_parameters(friction, whole.dof))
     errors: dict[str, Any] = {
         "rmse": left / np.sqrt(whole.samples),
         "relative_error_percent": _percent(left, whole.torque),
@@ -625,7 +625,7 @@ def _torque_errors(
         T, estimate, _, _ = _weighed(table, train)
         found = pull(T @ K, T @ estimate, prior, weight=as_one, initial=[phi, prior.phi])
         beta = K @ found.phi[found.best].ravel()
-        squares += test.residual(beta, train.following(beta, least)) ** 2
+        squares += test.error(beta, train.following(beta, least)) ** 2
     samples = sum(test.samples for _, test in folds)
     torque = float(np.linalg.norm([test.torque for _, test in folds]))
     return errors | {

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 import scipy.interpolate
+import scipy.ndimage
 import scipy.signal
 from jaxtyping import Bool, Float, Int
 
@@ -27,6 +28,13 @@ LONGEST_GAP = 0.1
 """Rows missing for longer than this [s] are bridged, but nothing near the bridge is kept."""
 STILL = 3e-3
 """Travel below which a joint stands still in a recording [rad or m]."""
+REST = 5.0
+"""Noise of the velocity within which a joint counts as at rest, in standard deviations."""
+TURN = 0.01
+"""How long before or after a joint turns its friction may [s]: MuJoCo's constraint does so before the velocity
+changes sign, the friction of a gear after it, and a filtered velocity shows neither."""
+BESIDE = 0.02
+"""How far the low-pass of the torque and a model of its noise carry a wrong sign [s]."""
 REPEATS = 0.02
 """A motion repeats where q differs by less than this share of its own spread (rms)."""
 _ORDER = 4  # of the Butterworth filter, before it runs back over its output
@@ -68,6 +76,8 @@ class Signals:
     """After which the motion repeats itself [s]."""
     noise: Float[np.ndarray, " dof"] | None
     """Noise of each joint's torque, sample to sample (`white_noise`) [N m]."""
+    position_noise: Float[np.ndarray, " dof"]
+    """Noise of each joint's position, sample to sample, before the low-pass [rad]."""
     repairs: Mapping[str, int]
     """What reading and resampling dropped, filled or moved, and how often."""
     notes: tuple[str, ...] = ()
@@ -90,6 +100,11 @@ class Signals:
     def output_rate(self) -> float:
         """Of the output grid [Hz]."""
         return self.rate / float(np.min(np.diff(self.keep), initial=len(self.time)))
+
+    @property
+    def unsure(self) -> Float[np.ndarray, "time dof"]:
+        """`unsure_sign` on the full grid."""
+        return unsure_sign(self.q, self.qd, self.qdd, self.position_noise, self.derivative_cutoff, self.rate)
 
     def lowpass(self, x: Float[np.ndarray, "time ..."]) -> Float[np.ndarray, "kept ..."]:
         """Anything on the full grid, low-passed without phase at `cutoff`, on the output grid."""
@@ -124,6 +139,7 @@ def prepare(
     bridged = np.max(np.diff(recording.time)) > LONGEST_GAP
     smooth = scipy.interpolate.PchipInterpolator if bridged else scipy.interpolate.CubicSpline
     q = resampled(recording.time, recording.q, time, smooth)
+    noise = position_noise(q)
     q, qd, qdd = derivatives(q, derivative_cutoff, full_rate)
     tau = None if recording.tau is None else resampled(recording.time, recording.tau, time)
     trim = max(0.6, 1 / cutoff) if trim is None else trim
@@ -141,6 +157,7 @@ def prepare(
         keep=keep,
         period=period(time, q),
         noise=None if recording.tau is None else white_noise(recording.tau),
+        position_noise=noise,
         repairs={**recording.repairs, **repairs},
         notes=recording.notes + notes,
     )
@@ -186,6 +203,49 @@ def white_noise(tau: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof"]
     Slower noise (resonances, drift) is not in it.
     """
     return np.sqrt(np.mean(np.diff(tau, n=3, axis=0) ** 2, axis=0) / 20)
+
+
+def position_noise(q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof"]:
+    """Noise of q from sample to sample [rad], from the median of third differences: gaps do not count."""
+    return np.median(np.abs(np.diff(q, n=3, axis=0)), axis=0) / (0.6745 * np.sqrt(20))
+
+
+def velocity_noise(
+    noise: Float[np.ndarray, " dof"], cutoff: float | Float[np.ndarray, "time dof"], rate: float
+) -> Float[np.ndarray, "*time dof"]:
+    """Noise of the velocity [rad/s] from that of q [rad], white up to the cutoff."""
+    return 2 * np.pi * noise * np.sqrt(2 * cutoff**3 / (3 * rate))
+
+
+def unsure_sign(
+    q: Float[np.ndarray, "time dof"],
+    qd: Float[np.ndarray, "time dof"],
+    qdd: Float[np.ndarray, "time dof"],
+    noise: Float[np.ndarray, " dof"],
+    cutoff: float,
+    rate: float,
+) -> Float[np.ndarray, "time dof"]:
+    """1 where the sign of the velocity, or of the friction, cannot be told, else 0; with what filters make of it
+    nearby.
+
+    There dry friction holds the joint and carries what it must, up to its level. Before a joint sets out from
+    rest, a sharp filter swings to the other side. A velocity smaller than its difference from that of a filter
+    that does not ring, than what noise of q pretends or than it changes in `TURN` has no sign.
+
+    Args:
+        q: positions [rad].
+        qd: velocities behind the low-pass [rad/s].
+        qdd: accelerations behind it [rad/s²].
+        noise: of q, from sample to sample [rad].
+        cutoff: of the low-pass [Hz].
+        rate: of the samples [Hz].
+    """
+    width = rate * np.sqrt(np.log(2)) / (2 * np.pi * cutoff)
+    smooth = scipy.ndimage.gaussian_filter1d(q, width, 0, mode="nearest", truncate=6.0)
+    error = np.abs(qd - np.gradient(smooth, 1 / rate, axis=0))
+    unsure = np.abs(qd) < 2 * error + REST * velocity_noise(noise, cutoff, rate) + TURN * np.abs(qdd)
+    reach = 2 * round(rate * BESIDE) + 1
+    return scipy.ndimage.maximum_filter1d(unsure.astype(float), reach, axis=0)
 
 
 def repeatability(signals: Signals) -> Float[np.ndarray, " dof"] | None:

@@ -40,8 +40,6 @@ PIECE = 2.0
 """Of a recording, about as long as a motion between two rests [s]."""
 TRIM = 0.4
 """Left out at both ends of a recording [s]."""
-_REST = 5.0
-"""Noise of the velocity within which a joint counts as at rest, in standard deviations."""
 _HELD = 0.01
 """Travel of a joint that friction may hold all the time, yielding both ways [rad]: bristles of real gears give
 way by 2 to 4 mrad before they break away."""
@@ -49,9 +47,6 @@ _GAP, _NEAR = 3.5, 0.12
 """Missing steps that make a gap, and how far beyond it samples do not count [s]."""
 _BESIDE_GAP, _LEAST_BESIDE = 0.06, 8
 """Rows beside a gap that tell where and how fast the arm was: of so long [s], and at least so many."""
-_TURN = 0.01
-"""How long before or after a joint turns its known friction may [s]: MuJoCo's constraint does so before the
-velocity changes sign, the friction of a gear after it, and a filtered velocity shows neither."""
 _SHAKEN = (2.5, 5.0)
 """Where the bands begin in which noise of q, differentiated twice, may outweigh the motion [Hz]."""
 _NOISE_SHARE = 0.5
@@ -64,8 +59,6 @@ _RINGING = 0.2
 """Share of it with which the filter of q still rings a period of its cutoff away."""
 _FROZEN, _MOVES = 0.1, 5.0
 """Torque that repeats itself for so long [s], while it must change by so many noises, is stuck."""
-_BESIDE = 0.02
-"""How far the low-pass of the torque and the noise model carry a wrong sign [s]."""
 _AT_ONCE = 24
 """Samples of the coarse grid that one product filters."""
 _UNFELT = 1e-12
@@ -263,7 +256,8 @@ def prepare(recording: Recording, arm: Arm, *, coarse: float = WORK_RATE) -> Tra
     q, qd, qdd = continued_derivatives(position, cutoff_q, rate)
     pretended = _pretended(position, _written_in(recording), cutoff_q, rate)
     trace = _on_grids(recording, rough, keep, (q, qd, qdd), pretended, arm, (), coarse)
-    doubtful = _unsure_sign(position, qd, pretended[0] + _TURN * np.abs(qdd), cutoff_q, rate)[keep]
+    noise_q = signals_.position_noise(position)
+    doubtful = signals_.unsure_sign(position, qd, qdd, noise_q, cutoff_q, rate)[keep]
     trace = dataclasses.replace(trace, unsure=doubtful, sharp=cutoff_q > least)
     if noise is None:
         return trace
@@ -396,9 +390,9 @@ def _pretended(
     rate: float,
 ) -> tuple[Float[np.ndarray, "*time dof"], Float[np.ndarray, "*time dof"]]:
     """Speed and travel that noise of q, behind its low-pass, may pretend of a joint at rest [rad/s, rad]."""
-    noise = _position_noise(position)
-    travel = _REST * noise * np.sqrt(2 * cutoff / rate) + 0.5 * step
-    return _REST * _velocity_noise(noise, cutoff, rate), travel
+    noise = signals_.position_noise(position)
+    travel = signals_.REST * noise * np.sqrt(2 * cutoff / rate) + 0.5 * step
+    return signals_.REST * signals_.velocity_noise(noise, cutoff, rate), travel
 
 
 def _written_in(recording: Recording) -> Float[np.ndarray, " dof"]:
@@ -481,26 +475,6 @@ def _weight(
     return weight
 
 
-def _unsure_sign(
-    q: Float[np.ndarray, "time dof"],
-    qd: Float[np.ndarray, "time dof"],
-    least: Float[np.ndarray, "time dof"],
-    cutoff: float,
-    rate: float,
-) -> Float[np.ndarray, "time dof"]:
-    """1 where the sign of the velocity cannot be told, else 0; with what filters make of it nearby.
-
-    Before a joint sets out from rest, a sharp filter swings to the other side. A velocity smaller than its
-    difference from that of a filter that does not ring, or than `least`, has no sign.
-    """
-    width = rate * np.sqrt(np.log(2)) / (2 * np.pi * cutoff)
-    smooth = scipy.ndimage.gaussian_filter1d(q, width, 0, mode="nearest", truncate=6.0)
-    error = np.abs(qd - np.gradient(smooth, 1 / rate, axis=0))
-    unsure = np.abs(qd) < 2 * error + least
-    reach = 2 * round(rate * _BESIDE) + 1
-    return scipy.ndimage.maximum_filter1d(unsure.astype(float), reach, axis=0)
-
-
 def _cut_off(
     q: Float[np.ndarray, "time dof"], qdd: Float[np.ndarray, "time dof"], cutoff: float, rate: float
 ) -> Float[np.ndarray, "time dof"]:
@@ -522,7 +496,7 @@ def _cut_off(
         grown = around(above - _SHARP * noise(above), 1 / cutoff)
         jumps = grown > _SHARPER**1.5 * around(lost, 1 / cutoff)
         lost = np.where(jumps, lost / (_SHARPER**2 - 1), lost)
-    return np.maximum(around(lost, 2 * _BESIDE), _RINGING * around(lost, 1 / cutoff))
+    return np.maximum(around(lost, 2 * signals_.BESIDE), _RINGING * around(lost, 1 / cutoff))
 
 
 def held_sign(
@@ -565,7 +539,7 @@ def position_cutoff(
     if noise is None:
         return most
     M = np.diag(masses(arm, q.mean(0)[None])[0])
-    crossing = np.sqrt(noise / np.maximum(np.abs(M) * _position_noise(q), 1e-12)) / (2 * np.pi)
+    crossing = np.sqrt(noise / np.maximum(np.abs(M) * signals_.position_noise(q), 1e-12)) / (2 * np.pi)
     return float(np.clip(1.3 * crossing.min(), min(_LEAST_CUTOFF, most), most))
 
 
@@ -614,15 +588,3 @@ def _least_step(x: Float[np.ndarray, "rows dof"]) -> Float[np.ndarray, " dof"]:
     """The least difference between two rows, which is what they are written in; infinite where all are alike."""
     steps = np.abs(np.diff(x, axis=0))
     return np.min(np.where(steps > 0, steps, np.inf), axis=0, initial=np.inf)
-
-
-def _position_noise(q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof"]:
-    """Noise of q from sample to sample [rad], from the median of third differences: gaps do not count."""
-    return np.median(np.abs(np.diff(q, n=3, axis=0)), axis=0) / (0.6745 * np.sqrt(20))
-
-
-def _velocity_noise(
-    noise: Float[np.ndarray, " dof"], cutoff: float | Float[np.ndarray, "time dof"], rate: float
-) -> Float[np.ndarray, "*time dof"]:
-    """Noise of the velocity [rad/s] from that of q [rad], white up to the cutoff."""
-    return 2 * np.pi * noise * np.sqrt(2 * cutoff**3 / (3 * rate))

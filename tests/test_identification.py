@@ -375,7 +375,7 @@ def test_robust_intervals_hold_the_truth_where_noise_is_coloured_and_shared():
         own, common = random.normal(size=(3, 3000)), random.normal(size=3000)
         noise = scipy.signal.sosfilt(lowpass, own + 0.5 * common)[:, 1000:]
         y = A @ x + sigma[:, None] * noise / noise.std()
-        problem = [Regression("noise", A, y, y)]
+        problem = [Regression("noise", A, y, y, np.zeros_like(y), np.ones_like(y))]
         fit = least_squares(problem, everything(problem), "joint")
         for name, covariance in zip(held, covariances(problem, fit.x, fit.sigma), strict=True):
             held[name].append(np.abs(fit.x - x) < 1.96 * np.sqrt(np.diag(covariance)))
@@ -388,7 +388,7 @@ def test_on_white_noise_both_error_bars_agree():
     random = np.random.default_rng(1)
     A, x = random.normal(size=(3, 4000, 8)), random.normal(size=8)
     y = A @ x + random.normal(size=(3, 4000))
-    problem = [Regression("white", A, y, y)]
+    problem = [Regression("white", A, y, y, np.zeros_like(y), np.ones_like(y))]
     fit = least_squares(problem, everything(problem), "joint")
     robust, textbook = (np.sqrt(np.diag(C)) for C in covariances(problem, fit.x, fit.sigma)[:2])
     assert np.allclose(textbook, 1 / np.sqrt(12000), rtol=0.1)
@@ -405,7 +405,7 @@ def test_correlated_samples_count_by_the_noise_that_they_share():
         e = random.normal(size=(3, 6000))
         for noise in (e, scipy.signal.lfilter([1], [1, -0.8], e)):
             y = 100 * (A.sum(-1) + noise)
-            problem = [Regression("noise", A, y, y)]
+            problem = [Regression("noise", A, y, y, np.zeros_like(y), np.ones_like(y))]
             fit = least_squares(problem, everything(problem), "joint")
             T = triangle(np.concatenate(triangles(problem, everything(problem))[:, :, :-1] / fit.sigma[0]))
             counted.append(samples_as_one(T, covariances(problem, fit.x, fit.sigma)[2]))
@@ -628,6 +628,6 @@ def test_a_joint_that_never_moved_gets_no_friction():
     """A joint of a real iiwa stood still but for 1e-294 rad/s, and was exported with frictionloss 3e293."""
     R = np.triu(np.ones((1, 4, 4)))
     R[0, :, 1], R[0, :, 2] = 1e-294, [1.0, 2.0, 0.0, 0.0]
-    own = Condensed(R, 100, 1.0).following(np.zeros(1), np.array([[0.0, -np.inf]]))
+    own = Condensed(R, R, 100, 1.0).following(np.zeros(1), np.array([[0.0, -np.inf]]))
     assert own[0, 0] == 0.0
     assert np.isfinite(own[0, 1])

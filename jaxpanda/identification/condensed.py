@@ -34,7 +34,10 @@ class Condensed:
     """Some samples of the recordings, every joint's columns and torque as one triangle."""
 
     R: Float[np.ndarray, "dof columns columns"]
-    """Of the base parameters' columns, the joint's own friction's, and the torque less what the model holds."""
+    """Of the base parameters' columns, the joint's own friction's, and the torque less what the model holds; each
+    sample weighed as in the regression."""
+    unweighted: Float[np.ndarray, "dof columns columns"]
+    """The same of the samples as they are."""
     samples: int
     torque: float
     """Norm of all joints' measured torque [N m], what relative errors are relative to."""
@@ -42,8 +45,9 @@ class Condensed:
     @classmethod
     def of(cls, regressions: Sequence[Regression], masks: Masks, rank: int) -> "Condensed":
         """The samples that masks leave."""
-        whole = triangles(regressions, masks)
-        dof, columns = len(whole), whole.shape[2]
+        weighed = triangles(regressions, masks)
+        plain = triangles(regressions, masks, weighted=False)
+        dof, columns = len(weighed), weighed.shape[2]
         extra = (columns - 1 - rank) // dof
         own = [
             [*range(rank), *range(rank + j * extra, rank + (j + 1) * extra), columns - 1] for j in range(dof)
@@ -51,8 +55,11 @@ class Condensed:
         torque = np.sqrt(
             sum(float(np.sum(r.tau[:, mask] ** 2)) for r, mask in zip(regressions, masks, strict=True))
         )
-        R = np.stack([triangle(Rj[:, chosen]) for Rj, chosen in zip(whole, own, strict=True)])
-        return cls(R, sum(int(mask.sum()) for mask in masks), torque)
+        R, unweighted = (
+            np.stack([triangle(Rj[:, chosen]) for Rj, chosen in zip(each, own, strict=True)])
+            for each in (weighed, plain)
+        )
+        return cls(R, unweighted, sum(int(mask.sum()) for mask in masks), torque)
 
     @property
     def dof(self) -> int:
@@ -61,9 +68,14 @@ class Condensed:
     def residual(
         self, beta: Float[np.ndarray, " base"], own: Float[np.ndarray, "dof extra"]
     ) -> Float[np.ndarray, " dof"]:
-        """Norm of what base parameters and friction leave of each joint's torque [N m]."""
-        x = np.concatenate([np.tile(beta, (self.dof, 1)), own, -np.ones((self.dof, 1))], 1)
-        return np.linalg.norm(np.einsum("jrc,jc->jr", self.R, x), axis=1)
+        """Norm of what base parameters and friction leave of each joint's torque, as weighed [N m]."""
+        return _left(self.R, beta, own)
+
+    def error(
+        self, beta: Float[np.ndarray, " base"], own: Float[np.ndarray, "dof extra"]
+    ) -> Float[np.ndarray, " dof"]:
+        """The same of the samples as they are [N m]."""
+        return _left(self.unweighted, beta, own)
 
     def classical(self, rank: int, weighting: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Least squares on these samples: base parameters, friction, and the residuals that weigh the joints."""
@@ -116,6 +128,15 @@ class Condensed:
         return np.array(own)
 
 
+def _left(
+    R: Float[np.ndarray, "dof columns columns"],
+    beta: Float[np.ndarray, " base"],
+    own: Float[np.ndarray, "dof extra"],
+) -> Float[np.ndarray, " dof"]:
+    x = np.concatenate([np.tile(beta, (len(R), 1)), own, -np.ones((len(R), 1))], 1)
+    return np.linalg.norm(np.einsum("jrc,jc->jr", R, x), axis=1)
+
+
 @dataclasses.dataclass(frozen=True)
 class Evidence:
     """What recordings hold against any links: as a whole, and block by block."""
@@ -129,6 +150,7 @@ class Evidence:
         parts = [self.whole, *(part for fold in self.folds for part in fold)]
         arrays = {
             "R": np.stack([part.R for part in parts]),
+            "unweighted": np.stack([part.unweighted for part in parts]),
             "samples": np.array([part.samples for part in parts]),
             "torque": np.array([part.torque for part in parts]),
         }
@@ -143,9 +165,11 @@ class Evidence:
         """
         try:
             arrays = inputs.read_npz(path)
+            plain = arrays.get("unweighted", arrays["R"])
+            columns = [arrays["R"], plain, arrays["samples"], arrays["torque"]]
             parts = [
-                Condensed(np.asarray(R, float), int(samples), float(torque))
-                for R, samples, torque in zip(arrays["R"], arrays["samples"], arrays["torque"], strict=True)
+                Condensed(np.asarray(R, float), np.asarray(unweighted, float), int(samples), float(torque))
+                for R, unweighted, samples, torque in zip(*columns, strict=True)
             ]
             return cls(parts[0], tuple(zip(parts[1::2], parts[2::2], strict=True)))
         except InputError:

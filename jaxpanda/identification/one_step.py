@@ -137,11 +137,7 @@ def _correlation(
     regressions: Sequence[Regression], masks: Masks, fit: Fit, T: Float[np.ndarray, "n n"]
 ) -> float:
     """How many of the residuals that the classical fit leaves tell as much as an independent one."""
-    left = [
-        dataclasses.replace(r, A=r.A[:, m], y=r.y[:, m], tau=r.tau[:, m])
-        for r, m in zip(regressions, masks, strict=True)
-        if m.any()
-    ]
+    left = [r.only(m) for r, m in zip(regressions, masks, strict=True) if m.any()]
     e = np.concatenate([r.residual(fit.x) for r in left], 1) / fit.sigma[:, None]
     return samples_as_one(T, covariances(left, fit.x, fit.sigma)[2], float(np.mean(e**2)))
 

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from ..arms.arm import Arm
 from ..errors import InputError
-from ..friction import columns
+from ..friction import LINEAR, columns
 from ..parameters import Base, base_parameters, triangle
 from ..signals import Signals
 
@@ -44,10 +44,29 @@ class Regression:
     """Measured torque less what the arm's model holds beyond rigid links [N m]."""
     tau: Float[np.ndarray, "dof time"]
     """Measured torque [N m]: what relative errors are relative to."""
+    unsure: Float[np.ndarray, "dof time"]
+    """Share of a sample in which a joint may rest, or turn: dry friction is then anything up to its level."""
+    weight: Float[np.ndarray, "dof time"]
+    """By which `A` and `y` are multiplied, one where nothing is doubted."""
 
     def residual(self, x: Float[np.ndarray, " columns"]) -> Float[np.ndarray, "dof time"]:
-        """What the unknowns `x` leave of the torque [N m]."""
+        """What the unknowns `x` leave of the torque, as weighted [N m]."""
         return self.y - self.A @ x
+
+    def error(self, x: Float[np.ndarray, " columns"]) -> Float[np.ndarray, "dof time"]:
+        """The same as it is [N m]."""
+        return self.residual(x) / self.weight
+
+    def doubted(self, level: Float[np.ndarray, " dof"], sigma: Float[np.ndarray, " dof"]) -> "Regression":
+        """With weights for dry friction of such levels beside such residuals [N m]."""
+        weight = 1 / np.sqrt(1 + (np.abs(level) / sigma)[:, None] ** 2 * self.unsure**2)
+        more = weight / self.weight
+        return dataclasses.replace(self, A=self.A * more[:, :, None], y=self.y * more, weight=weight)
+
+    def only(self, mask: Bool[np.ndarray, " time"]) -> "Regression":
+        """Some samples."""
+        taken = {name: getattr(self, name)[:, mask] for name in ("A", "y", "tau", "unsure", "weight")}
+        return dataclasses.replace(self, **taken)
 
 
 def regression(signals: Signals, arm: Arm, base: Base, friction: str) -> Regression:
@@ -79,7 +98,8 @@ def regression(signals: Signals, arm: Arm, base: Base, friction: str) -> Regress
             raise InputError(
                 f"{signals.name}: the filtered {what} is not finite; jaxpanda inspect shows where"
             )
-    return Regression(signals.name, A, tau - known, tau)
+    unsure = np.clip(signals.lowpass(signals.unsure).T, 0.0, 1.0)
+    return Regression(signals.name, A, tau - known, tau, unsure, np.ones_like(tau))
 
 
 def moving(signals: Signals) -> Float[np.ndarray, "time dof"]:
@@ -153,16 +173,40 @@ def excited(regressions: Sequence[Regression], base: Base) -> tuple[list[Regress
     return [dataclasses.replace(r, A=A) for r, A in zip(regressions, reduced, strict=True)], fewer
 
 
-def triangles(regressions: Sequence[Regression], masks: Masks) -> Float[np.ndarray, "dof rows columns"]:
+def triangles(
+    regressions: Sequence[Regression], masks: Masks, *, weighted: bool = True
+) -> Float[np.ndarray, "dof rows columns"]:
     r"""The R of a QR factorisation of $[A_j\; y_j]$ a joint: all that least squares needs of the data."""
     R = []
     for joint in range(len(regressions[0].A)):
         parts = [
             np.column_stack([r.A[joint, mask], r.y[joint, mask]])
+            / (1.0 if weighted else r.weight[joint, mask, None])
             for r, mask in zip(regressions, masks, strict=True)
         ]
         R.append(triangle(np.concatenate(parts)))
     return np.stack(R)
+
+
+def doubting_rest(
+    regressions: Sequence[Regression], base: Base, friction: str, held: Float[np.ndarray, " dof"]
+) -> list[Regression]:
+    r"""The same, samples weighed down in which a joint with Coulomb friction may rest or turn.
+
+    There friction is anything up to its level $F_c$, whatever the sign of the velocity: for a share $u$ of a
+    sample the residual's variance is $\sigma^2 + (u F_c)^2$. Taken for the law's, such samples make $F_c$ too
+    small, and viscous friction of what is missing. The level is what the model holds, `held` [N m], with what is
+    found beside it. A sigmoid turns as the joint is found to: nothing is doubted.
+    """
+    names, dof = LINEAR.get(friction, ()), len(held)
+    if friction not in LINEAR or not ("coulomb" in names or np.any(held)):
+        return list(regressions)
+    for _ in range(_REWEIGHTINGS):
+        fit = least_squares(regressions, everything(regressions), "joint")
+        own = fit.x[base.rank :].reshape(dof, -1)
+        found = own[:, names.index("coulomb")] if "coulomb" in names else np.zeros(dof)
+        regressions = [r.doubted(held + found, fit.sigma) for r in regressions]
+    return list(regressions)
 
 
 @dataclasses.dataclass(frozen=True)

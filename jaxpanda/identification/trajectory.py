@@ -20,7 +20,16 @@ from ..recordings import Recording
 from ..signals import Signals, blocks_many, prepare, repeatability
 from .condensed import Condensed, Evidence
 from .one_step import PRIOR, Prior, feasible_least_squares
-from .regression import Fit, Masks, Regression, everything, excited, least_squares, regression
+from .regression import (
+    Fit,
+    Masks,
+    Regression,
+    doubting_rest,
+    everything,
+    excited,
+    least_squares,
+    regression,
+)
 from .result import RELIABLE, Identification, check_folds, of_model
 from .sigmoid import Shape, fit_shape, linearised, with_shape
 from .statistics import covariances, determined
@@ -178,6 +187,7 @@ def _pose(signals: Sequence[Signals], arm: Arm, friction: str, weighting: str) -
     whole = arm_base_parameters(arm)
     linear = friction if friction in LINEAR else "none"
     rigid, base = excited([regression(s, arm, whole, linear) for s in signals], whole)
+    rigid = doubting_rest(rigid, base, friction, np.asarray(arm.frictionloss))
     return _Problem(signals, rigid, base, whole.rank, friction, weighting)
 
 
@@ -233,7 +243,7 @@ def _cross_validate(
     for k, splits in enumerate(blocks_many(problem.signals, folds)):
         solved = solver([train for train, _ in splits])
         for r, residual, done, (_, test) in zip(solved.regressions, residuals, seen, splits, strict=True):
-            residual[:, test] = r.residual(solved.fit.x)[:, test]
+            residual[:, test] = r.error(solved.fit.x)[:, test]
             done |= test
         train, test = ([split[i] for split in splits] for i in (0, 1))
         halves.append(tuple(Condensed.of(solved.regressions, m, problem.base.rank) for m in (train, test)))
@@ -254,7 +264,7 @@ def _result(
     fit, base, regressions = solved.fit, problem.base, solved.regressions
     beta = fit.x[: base.rank]
     robust, classical, joint, std, textbook = _uncertainty(problem, solved)
-    e = np.concatenate([r.residual(fit.x) for r in regressions], 1)
+    e = np.concatenate([r.error(fit.x) for r in regressions], 1)
     unseen = unseen_percent = None
     if held_out is not None:
         unseen = np.concatenate([residual[:, done] for residual, done in held_out], 1)
