@@ -74,6 +74,13 @@ class Recorded:
         return cls(start, stop, tuple(str(x) for x in document["digests"]))
 
 
+def _placed(effect: AbstractEffect, recordings: Sequence[str] | None) -> AbstractEffect | None:
+    """As it acts in the last of the recordings, or in a later one."""
+    if recordings is None:
+        return effect.placed("", later=True)
+    return effect.placed(recordings[-1], later=any(name in recordings[:-1] for name in effect.recordings))
+
+
 def _digest(recording: Recording) -> str:
     return hashlib.sha256(np.ascontiguousarray(recording.q, float).tobytes()).hexdigest()
 
@@ -243,9 +250,21 @@ class Corrected(eqx.Module):
         )
 
     def measured_torque(
-        self, motion: Motion, channels: Channels, held_sign: Float[np.ndarray, "time dof"]
+        self,
+        motion: Motion,
+        channels: Channels,
+        held_sign: Float[np.ndarray, "time dof"],
+        recordings: Sequence[str] | None = None,
     ) -> Float[np.ndarray, "time dof"]:
-        """What the torque sensors would show over a motion recorded later [N m], both grids being the same."""
+        """What the torque sensors show over a motion [N m], both grids being the same.
+
+        Args:
+            motion: what the arm does.
+            channels: the same on the fine grid.
+            held_sign: of the model's Coulomb friction, -1 to 1.
+            recordings: names of those that the effects were found in up to this one, in their order; None for a
+                motion recorded later.
+        """
         tau = (
             motion.torque
             + np.asarray(self.damping_change) * motion.qd
@@ -257,7 +276,7 @@ class Corrected(eqx.Module):
         for last in (False, True):
             stretches = Stretches(dataclasses.replace(channels, shown=tau.copy() if last else None))
             for bound, c in pairs:
-                effect = bound.placed("", later=True)
+                effect = _placed(bound, recordings)
                 if effect is None or effect.takes_shown != last:
                     continue
                 if isinstance(effect, AbstractJointEffect):

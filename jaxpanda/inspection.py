@@ -29,6 +29,7 @@ _UNTOLD = (
     "torque's unit and sign cannot be told: the model's torque hardly varies over this motion, or parts of it "
     "disagree"
 )
+_OPPOSITE = 0.5  # share of d(q)/dt with the other sign from which dq is said to have it
 _UNSURE = 0.25  # deviation of a scale, or its share of a large one, from which it is not told
 
 
@@ -51,8 +52,10 @@ class JointInspection:
     """How often the joint turns round."""
     rest: float
     """Share of the time below `MOVING`."""
+    velocity_scale: float | None
+    """k of dq = k d(q)/dt; -1 where dq has the other sign."""
     velocity_lag: float | None
-    """By how much the logged dq is late behind d(q)/dt [s]."""
+    """By how much the logged dq, or its opposite, is late behind d(q)/dt [s]."""
     torque_step: float | None
     """Smallest difference between two torques: the sensor's resolution, or the file's; None where torque never
     changes [N m]."""
@@ -253,6 +256,7 @@ def _joint(
     tau = recording.tau
     repeat = repeatability(signals)
     step = None if tau is None else _step(tau[:, j])
+    scale, lag = _velocity(j, recording, signals) or (None, None)
     scales = (None, None) if model is None or step is None else _scales(j, signals, model)
     return JointInspection(
         joint=j + 1,
@@ -263,7 +267,8 @@ def _joint(
         acceleration=float(np.abs(qdd).max()),
         reversals=_reversals(qd),
         rest=float(np.mean(np.abs(qd) < MOVING)),
-        velocity_lag=_velocity_lag(j, recording, signals),
+        velocity_scale=scale,
+        velocity_lag=lag,
         torque_step=step,
         noise=None if tau is None else float(white_noise(tau)[j]),
         repeat_noise=None if repeat is None else float(repeat[j]),
@@ -283,14 +288,18 @@ def _step(tau: Float[np.ndarray, " time"]) -> float | None:
     return float(steps.min()) if steps.size else None
 
 
-def _velocity_lag(j: int, recording: Recording, signals: Signals) -> float | None:
-    r"""$\delta$ of $\dot q_{logged}(t) = \dot q(t - \delta)$ by Gauss-Newton, both low-passed alike [s]."""
-    if recording.qd is None:
+def _velocity(j: int, recording: Recording, signals: Signals) -> tuple[float, float] | None:
+    r"""k and $\delta$ [s] of $\dot q_{logged}(t) = k\,\dot q(t - \delta)$, both low-passed alike.
+
+    k by least squares without a delay; the delay of what has the sign of k, as large as it is, by Gauss-Newton.
+    """
+    moved = signals.qd[signals.keep, j]
+    if recording.qd is None or np.abs(moved).max() < 5 * MOVING:
         return None
     logged = np.interp(signals.time, recording.time, recording.qd[:, j])
     logged = zero_phase(logged, signals.derivative_cutoff, signals.rate)[signals.keep]
-    if np.abs(signals.qd[signals.keep, j]).max() < 5 * MOVING:
-        return None
+    scale = float(np.sum(logged * moved) / np.sum(moved**2))
+    logged = logged if scale > 0 else -logged
     lag = 0.0
     for _ in range(5):
         velocity, acceleration = (
@@ -298,7 +307,7 @@ def _velocity_lag(j: int, recording: Recording, signals: Signals) -> float | Non
         )
         lag -= float(np.sum((logged - velocity) * acceleration) / np.sum(acceleration**2))
         lag = float(np.clip(lag, -0.5, 0.5))
-    return lag
+    return scale, lag
 
 
 def _states(arm: Arm, signals: Signals) -> _States:
@@ -449,8 +458,14 @@ def _unit_verdicts(found: Inspection, arm: Arm | None) -> list[str]:
         said.append(
             f"q reaches {furthest:.2f}, more than a turn: rad if a joint turns on, else check for degrees"
         )
-    if found.velocity_scale is not None:
+    if found.velocity_scale is not None and found.velocity_scale > 0:
         said.append(f"dq in {found.unit('rad/s')}: {found.velocity_scale:.3f} times d(q)/dt")
+    scales = {j.joint: j.velocity_scale for j in found.joints if j.velocity_scale is not None}
+    opposite = [joint for joint, scale in scales.items() if scale < -_OPPOSITE]
+    if opposite:
+        said.append(
+            f"dq of joints {_listed(opposite)} has the opposite sign of d(q)/dt: velocities are taken from q"
+        )
     lags = [joint.velocity_lag for joint in found.joints if joint.velocity_lag is not None]
     if lags and abs(np.median(lags)) > 2e-3:
         said.append(f"dq is {1e3 * np.median(lags):.1f} ms late behind d(q)/dt: velocities are taken from q")

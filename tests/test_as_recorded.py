@@ -12,7 +12,9 @@ from jaxpanda import Arm, Recording
 from jaxpanda.corrected import Corrected, Recorded
 from jaxpanda.effects import Turn
 from jaxpanda.effects.drive import Armature
+from jaxpanda.effects.effect import EVER
 from jaxpanda.effects.friction import FrictionDrift, ViscousFriction
+from jaxpanda.effects.load import PayloadChange
 from jaxpanda.effects.sensing import TorqueDrift
 from jaxpanda.prediction.as_recorded import as_recorded, misleading
 from jaxpanda.prediction.predict import predicted
@@ -179,6 +181,28 @@ def test_effects_that_make_the_recordings_own_torque_worse_are_named():
     assert misleading([trajectory(recording)], wrong, 8) == {7}
     assert misleading([trajectory(recording)], wrong, 1) == {0}
     assert misleading([trajectory(recording)], lacking, 0) == set()
+
+
+def test_what_happened_in_a_recording_is_judged_where_it_happened():
+    """A body taken up late was taken for one that had been there all along, and so left out of the model."""
+    arm = Arm.panda()
+    slow = rubbing(arm, ())
+    assert slow.tau is not None
+    effect, c = PayloadChange(6, 6.0, EVER, "slow.csv", "gained"), np.eye(10)[0]
+    links = np.concatenate([np.zeros((6, 10)), (effect.body @ c)[None]])
+    weight = trajectory(slow).trace(arm).motion.of_links(links)
+    taken_up = dataclasses.replace(slow, tau=slow.tau + np.where(slow.time < 6.0, 0.0, 1.0)[:, None] * weight)
+    late = dataclasses.replace(slow, name="late.csv", time=slow.time + 20.0, tau=slow.tau + weight)
+    early = dataclasses.replace(slow, name="early.csv", time=slow.time - 20.0)
+    found = dataclasses.replace(Corrected.of(arm), effects=(effect,), coefficients=(jnp.asarray(c),))
+    whole = [trajectory(one) for one in (early, taken_up, late)]
+    assert misleading(whole, found, 1) == set()
+    for one, names in zip(
+        whole, (["early.csv"], ["early.csv", "slow.csv"], ["slow.csv", "late.csv"]), strict=True
+    ):
+        trace, torque = predicted(one, found, names)
+        away = np.abs(trace.motion.time - 6.0) > 0.3  # a low-pass rounds the step
+        assert np.all(np.std((trace.tau - torque)[away], axis=0) < 1.1 * NOISE)
 
 
 def test_a_motion_whose_clock_is_its_own_comes_after_the_recordings():

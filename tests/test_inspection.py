@@ -180,6 +180,17 @@ def test_everything_is_plain_json_and_fits_a_table():
     assert all(verdict in found.lines() for verdict in found.verdicts)
 
 
+def test_velocities_of_the_other_sign_are_told_as_such():
+    recording = virtual()
+    assert recording.qd is not None
+    signs = np.where(np.arange(7) == 2, -1.0, 1.0)
+    found = inspect(dataclasses.replace(recording, qd=signs * recording.qd), Arm.panda())
+    assert "dq of joints 3 has the opposite sign of d(q)/dt" in said(found)
+    assert found.joints[2].velocity_scale == pytest.approx(-1.0, abs=0.02)
+    as_it_was = inspect(recording, Arm.panda()).joints[2]
+    assert found.joints[2].velocity_lag == pytest.approx(as_it_was.velocity_lag, abs=1e-9)
+
+
 def test_the_log_of_gaz_et_al_is_what_the_notes_say(data):
     found = inspect(load(data / "gaz_panda"), Arm.panda())
     assert found.identifiable is not None

@@ -79,13 +79,17 @@ def misleading(whole: Sequence[Trajectory], corrected: Corrected, count: int) ->
     A search compares motion and torque below the frequency up to which both are known; a prediction shows all of
     the motion. What only fitted the slow part is no law of this arm.
     """
-    traces = [predicted(one, corrected)[0] for one in whole]
+    traces, names = [predicted(one, corrected)[0] for one in whole], _up_to(whole)
     counts = np.concatenate([t.weight > 0 for t in traces])
     measured = np.concatenate([np.asarray(t.tau) for t in traces])[counts]
     squares = lambda x: np.maximum(np.sum((measured - x) ** 2, 0), 1e-300)
 
     def predicted_by(one: Corrected) -> Float[np.ndarray, "rows dof"]:
-        return np.concatenate([one.measured_torque(t.motion, t.channels, t.sign) for t in traces])[counts]
+        said = [
+            one.measured_torque(t.motion, t.channels, t.sign, before)
+            for t, before in zip(traces, names, strict=True)
+        ]
+        return np.concatenate(said)[counts]
 
     torque, own = predicted_by(corrected), {}
     first = len(corrected.effects) - count
@@ -122,11 +126,17 @@ def _squares(moved: Sequence[Trajectory], corrected: Corrected) -> Float[np.ndar
 def _pieces(moved: Sequence[Trajectory], corrected: Corrected) -> Float[np.ndarray, "pieces dof"]:
     """The same for each piece of the recordings."""
     out = []
-    for one in moved:
-        trace, torque = predicted(one, corrected)
+    for one, names in zip(moved, _up_to(moved), strict=True):
+        trace, torque = predicted(one, corrected, names)
         assert trace.tau is not None
         squares = (trace.tau - torque) ** 2 * (trace.weight > 0)[:, None]
         time = trace.motion.time
         count = max(round(float(time[-1] - time[0]) / PIECE), 1)
         out += [piece.sum(0) for piece in np.array_split(squares, count)]
     return np.array(out)
+
+
+def _up_to(moved: Sequence[Trajectory]) -> list[list[str]]:
+    """For each recording its name, after those before it."""
+    names = [one.recording.name for one in moved]
+    return [names[: k + 1] for k in range(len(names))]

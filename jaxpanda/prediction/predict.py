@@ -59,14 +59,17 @@ def passed_on(
     return np.asarray(links.plant(recording.name).true(jnp.asarray(recording.time), jnp.asarray(tau)))
 
 
-def predicted(moved: Trajectory, corrected: Corrected) -> tuple[Trace, Float[np.ndarray, "time dof"]]:
-    """A motion on the grid of a prediction, and the torque there [N m]."""
+def predicted(
+    moved: Trajectory, corrected: Corrected, recordings: Sequence[str] | None = None
+) -> tuple[Trace, Float[np.ndarray, "time dof"]]:
+    """A motion on the grid of a prediction, and the torque there [N m]; `recordings` as in
+    `Corrected.measured_torque`."""
     out: dict[float | None, tuple[Trace, np.ndarray]] = {}
     cutoffs = corrected.cutoffs or (None,) * corrected.arm.dof
     for cutoff in dict.fromkeys(cutoffs):
         trace = moved.trace(corrected.arm, corrected.turns, np.inf if cutoff is None else cutoff)
         trace = trace.showing(corrected.friction_shown)
-        out[cutoff] = trace, corrected.measured_torque(trace.motion, trace.channels, trace.sign)
+        out[cutoff] = trace, corrected.measured_torque(trace.motion, trace.channels, trace.sign, recordings)
     torque = np.stack([out[cutoff][1][:, joint] for joint, cutoff in enumerate(cutoffs)], 1)
     return out[cutoffs[0]][0], torque
 

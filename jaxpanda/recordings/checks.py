@@ -90,11 +90,15 @@ def _rate(recording: Recording) -> None:
     fastest, slowest = 1 / (RATES[1] * _MARGIN), _MARGIN / RATES[0]
     if fastest <= step <= slowest:
         return
-    for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+    for unit, short, factor in (
+        ("milliseconds", "ms", 1e3),
+        ("microseconds", "us", 1e6),
+        ("nanoseconds", "ns", 1e9),
+    ):
         if fastest <= step / factor <= slowest:
             raise InputError(
                 f"{recording.name}: column time looks like {unit} (its median step is {step:g}), where "
-                f"seconds are needed: divide it by {factor:g}"
+                f"seconds are needed: divide it by {factor:g}, or say it, as --columns time=time:{short}"
             )
     raise InputError(
         f"{recording.name}: column time has a median step of {step:g} s ({1 / step:g} Hz), where sample "
@@ -217,8 +221,10 @@ def _radians(recording: Recording) -> None:
     row = int(np.argmax(np.abs(recording.q[:, j])))
     raise InputError(
         f"{recording.name}: column q_{j + 1} reaches {recording.q[row, j]:g} at {recording.time[row]:g} "
-        "s, which looks like degrees where radians are needed: multiply positions (and velocities) by "
-        "pi/180; if they are radians of a joint that turns on, take whole turns off it, or cut the recording"
+        "s, which looks like degrees where radians are needed, or like millimetres of a joint that slides: "
+        "multiply positions (and velocities) by pi/180, or say it, as --columns q=q_{j}:deg dq=dq_{j}:deg/s, "
+        f"of one joint q_{j + 1}=q_{j + 1}:mm; if they are radians of a joint that turns on, take whole turns off"
+        " it, or cut the recording"
     )
 
 
@@ -247,8 +253,14 @@ def _velocity_unit(recording: Recording) -> None:
     if k is None:
         return
     for factor, cure in (
-        (180 / np.pi, "dq looks like degrees per second: multiply it by pi/180"),
-        (np.pi / 180, "q looks like degrees beside dq in rad/s: multiply q by pi/180"),
+        (
+            180 / np.pi,
+            "dq looks like degrees per second: multiply it by pi/180, or say --columns dq=dq_{j}:deg/s",
+        ),
+        (
+            np.pi / 180,
+            "q looks like degrees beside dq in rad/s: multiply q by pi/180, or say --columns q=q_{j}:deg",
+        ),
         (30 / np.pi, "dq looks like revolutions per minute: multiply it by pi/30"),
         (1e3, "dq is a thousand times d(q)/dt: check the units of time and dq"),
         (1e-3, "dq is a thousandth of d(q)/dt: check the units of time and dq"),

@@ -22,8 +22,8 @@ from .recording import Origin, Recording, Torque
 
 UNITS: Mapping[str, Mapping[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "q": {"rad": 1.0, "deg": np.pi / 180},
-    "dq": {"rad/s": 1.0, "deg/s": np.pi / 180},
+    "q": {"rad": 1.0, "deg": np.pi / 180, "m": 1.0, "mm": 1e-3},
+    "dq": {"rad/s": 1.0, "deg/s": np.pi / 180, "m/s": 1.0, "mm/s": 1e-3},
 }
 """Units that a channel may be said to have, each in SI; of torque `--torque-unit` speaks."""
 _SHOWN = 12

@@ -1,5 +1,7 @@
 """Tables of text that controllers write: libfranka, panda-py, UR, KUKA; and what `--columns` says of others."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from made import assert_same, made
@@ -357,3 +359,16 @@ def test_the_ur10e_s_real_log_has_no_header(data):
     columns = ("time=1", "q=2..7", "dq=8..13", "tau=14..19")
     read = load(data / "ur10e" / "ur-20_02_19_14harm50sec.csv.gz", reading=Reading(columns))
     assert (read.samples, read.dof, round(read.rate)) == (5375, 6, 100)
+
+
+def test_a_slide_in_millimetres_is_said_of_that_joint_alone(tmp_path):
+    r, slides = made(), np.arange(7) == 1
+    r = dataclasses.replace(r, q=np.where(slides, 0.1 * r.q, r.q), qd=np.where(slides, 0.1 * r.qd, r.qd))
+    columns = {"time": r.time} | numbered("q_{j}", np.where(slides, 1000 * r.q, r.q), 1)
+    columns |= numbered("dq_{j}", np.where(slides, 1000 * r.qd, r.qd), 1) | numbered("tau_{j}", r.tau, 1)
+    (tmp_path / "rec.csv").write_text(table(columns))
+    with pytest.raises(InputError, match=r"of one joint q_2=q_2:mm"):
+        load(tmp_path / "rec.csv")
+    read = load(tmp_path / "rec.csv", reading=Reading(("q_2=q_2:mm", "dq_2=dq_2:mm/s")))
+    np.testing.assert_allclose(read.q, r.q, rtol=1e-12)
+    np.testing.assert_allclose(read.qd, r.qd, rtol=1e-12)
