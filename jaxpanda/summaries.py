@@ -443,11 +443,22 @@ def ensemble(found: Any) -> Sequence[Section]:
     ]
     kinds = document["friction"]["names"]
     tables = [Table(["link", "m kg", "cx m", "cy m", "cz m"], rows, "Links: what the recordings leave open")]
+    effects = document["effect_coefficients"]
     if kinds:
         rows = [[joint["name"], *(between(*joint[kind]) for kind in kinds)] for joint in document["joints"]]
-        tables.append(
-            Table(["joint", *kinds], rows, f"Friction beyond the model [{unit('N m s/rad')}, {unit('N m')}]")
-        )
+        beyond = "Friction beyond the model" + (" and what was found" if effects else "")
+        tables.append(Table(["joint", *kinds], rows, f"{beyond} [{unit('N m s/rad')}, {unit('N m')}]"))
+    if effects:
+        rows = [
+            [
+                one["effect"].replace("_", " "),
+                ", ".join(map(str, one["joints"])),
+                f"{one['name']} {one['unit']}",
+                between(*one["value"]),
+            ]
+            for one in effects
+        ]
+        tables.append(Table(["effect", "joints", "coefficient", "value"], rows, "What the diagnosis found"))
     return [Section("Ensemble", [*sentences, *document["notes"]], tables)]
 
 

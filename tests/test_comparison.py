@@ -70,6 +70,7 @@ def test_false_alarms_are_rare(healthy, tmp_path):
     assert verdicts.count("agree") >= 11
 
 
+@pytest.mark.slow
 def test_a_changed_friction_is_told_at_its_joint(healthy, tmp_path):
     coulomb = np.array([0.3, 0.5, 0.3])
     found = compare(healthy, identified(tmp_path / "worn", 3, dataclasses.replace(FRICTION, coulomb=coulomb)))

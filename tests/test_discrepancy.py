@@ -319,6 +319,7 @@ def resting(level: float, held: float, seconds: float = 30.0):
     return dataclasses.replace(r, q=q, tau=tau + NOISE * rng.normal(size=q.shape))
 
 
+@pytest.mark.slow
 def test_what_known_friction_holds_through_a_long_rest_is_no_law_of_its_own():
     """Nearly its level, for 22 s: of each sample by itself it made a contact or a drift likelier by 500 nats."""
     arm, steps = dataclasses.replace(Arm.panda(), frictionloss=jnp.zeros(7).at[3].set(2.0)), []
@@ -326,7 +327,8 @@ def test_what_known_friction_holds_through_a_long_rest_is_no_law_of_its_own():
     assert not [step for step in steps if step.startswith("add")]
 
 
-@pytest.mark.parametrize("held", [0.5, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.2, -0.3))])
+@pytest.mark.slow
+@pytest.mark.parametrize("held", [0.5, 0.2, -0.3])
 def test_friction_that_holds_a_load_through_a_long_rest_is_friction_alone(held):
     """What it holds is no offset beside it."""
     problem = pose((prepare(resting(0.5, held), Arm.panda()),), (True,), "exact").problem
@@ -334,6 +336,7 @@ def test_friction_that_holds_a_load_through_a_long_rest_is_friction_alone(held):
     assert (term.effect.family, term.effect.joints) == ("friction", (3,))
 
 
+@pytest.mark.slow
 def test_friction_is_neither_exchanged_nor_dropped_for_what_is_less_likely_in_its_own_noise(monkeypatch):
     """In friction's noise a rest tells little for it: an offset in its place looked likelier, then went."""
     problem = pose((prepare(resting(0.5, 0.5), Arm.panda()),), (True,), "exact").problem

@@ -78,6 +78,7 @@ def reachable(truth):
     return A, b, bounds, found
 
 
+@pytest.mark.slow
 def test_a_reachable_right_hand_side_is_reached_from_most_starts(reachable):
     A, b, _, found = reachable
     assert np.mean((found.objective < 1e-10) & (found.violation == 0)) > 0.9
@@ -100,6 +101,7 @@ def test_what_links_of_the_panda_have_is_met_by_nearly_all_starts_each_in_its_ow
         assert all(least_eigenvalue(link) > 0 for link in phi)
 
 
+@pytest.mark.slow
 def test_where_boxes_on_inertias_bind_exact_coefficients_are_met_all_the_same():
     A, _, bounds = published_problem()
     truth = Arm.panda()

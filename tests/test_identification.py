@@ -609,6 +609,7 @@ def test_variances_that_overflow_are_refused(found):
         retrieve(huge, starts=2, certificate=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["trajectory", "one_step"])
 def test_gravity_of_resting_joints_is_not_traded_for_offsets_of_their_sensors(method):
     """Of a real iiwa upright, whose joints 1 and 6 moved, links were 1.8 and 2.6 N m off at joints that rested,

@@ -116,6 +116,7 @@ def test_a_mounting_is_one_of_all_recordings(trial, tmp_path):
     assert not borne_out(seeming, [trial.made("exact", *CASE)[1]], arm)
 
 
+@pytest.mark.slow
 def test_a_unit_of_one_recording_alone_takes_more_than_that_of_all(trial, tmp_path):
     """Friction that sticks may look like another unit for a while; the same logger wrote the other recording."""
     text, scaled = trial.made("N mm", *CASE)
@@ -129,6 +130,7 @@ def test_a_unit_of_one_recording_alone_takes_more_than_that_of_all(trial, tmp_pa
     assert not borne_out(seeming, [plain], arm)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", ["exact", "friction", "links", "payload", "gain", "level", "offset", "delay"]
 )
@@ -175,6 +177,7 @@ def files(trial, tmp_path):
     return tmp_path, ["--model", str(tmp_path / "arm.xml"), "--recording", str(tmp_path / "free.csv")]
 
 
+@pytest.mark.slow
 def test_diagnose_says_what_the_column_is_and_seeks_no_physics_in_it(files):
     folder, given = files
     assert main(["diagnose", *given, "--out", str(folder / "out")]) == 0

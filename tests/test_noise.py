@@ -37,6 +37,7 @@ def noise_of(seconds: float, seed: int):
     return pose((prepare(still_right(seconds, seed), ARM),), (True,), "exact").problem.noise(())
 
 
+@pytest.mark.slow
 def test_a_simulation_without_noise_is_consistent():
     """Over so little noise a prior was less than what rounding takes off a product: nothing could be solved."""
     t = np.arange(0, 8, 1 / 200)

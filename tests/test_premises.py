@@ -16,6 +16,7 @@ from jaxpanda.simulation import JointFriction, Sensors, random_trajectory, simul
 from jaxpanda.traces import prepare
 
 
+@pytest.mark.slow
 def test_what_healthy_recordings_show_may_be_refitted_in_all_recordings():
     motion = random_trajectory(panda_mjcf(), 1, period=3.0)
     made = [
@@ -35,7 +36,8 @@ def test_what_healthy_recordings_show_may_be_refitted_in_all_recordings():
     assert not np.any(news[1])  # an effect that is searched for acts in the suspect recording alone
 
 
-@pytest.mark.parametrize("comes_again", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("comes_again", [True, False])
 def test_what_healthy_recordings_show_is_predicted_where_it_comes_again(monkeypatch, comes_again):
     """Two seconds of an arm had a crosstalk of 1.05, with which another motion was predicted 20 N·m off."""
     motion, made = random_trajectory(panda_mjcf(), 1, period=3.0), []

@@ -168,6 +168,7 @@ def test_evidence_of_another_identification_is_not_believed(identified, tmp_path
     assert (links.weighting, links.relative_error_percent) == ("torque", None)
 
 
+@pytest.mark.slow
 def test_retrieve_and_export_take_the_arm_that_was_identified(tmp_path, capsys):
     """`retrieve` asked for bounds or a model; `export` took the Panda."""
     model, log, run = tmp_path / "arm.xml", tmp_path / "arm.csv", tmp_path / "run"

@@ -67,6 +67,7 @@ def test_chunks_that_are_fetched_in_pieces_come_whole_and_in_order():
     np.testing.assert_array_equal(found[1][:, 0], np.arange(starts) ** 2)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_from_its_last_chunk_with_the_same_bits(whole, tmp_path):
     path, told = tmp_path / "starts.partial", []
     interrupted(path)

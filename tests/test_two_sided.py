@@ -80,6 +80,7 @@ def loaded(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_each_cause_is_found_on_its_side_of_the_drives(loaded):
     document = result(loaded / "why" / "diagnosis.json")
     sides = {f["effect"]: f["side"] for f in document["findings"]}
@@ -98,6 +99,7 @@ def test_each_cause_is_found_on_its_side_of_the_drives(loaded):
     assert np.all(left < 1.5 * np.asarray(document["fit_motor"]["noise_floor"]))
 
 
+@pytest.mark.slow
 def test_both_torques_of_another_motion_are_predicted(loaded):
     later = load(loaded / "later.csv")
     told = np.genfromtxt(loaded / "tau.csv", delimiter=",", names=True)
@@ -106,6 +108,7 @@ def test_both_torques_of_another_motion_are_predicted(loaded):
         assert np.all(np.sqrt(np.mean(error**2, 0)) < 1.2 * noise)
 
 
+@pytest.mark.slow
 def test_the_corrected_arm_is_the_whole_one_as_its_motors_move_it(loaded):
     later, corrected = load(loaded / "later.csv"), Corrected.load(loaded / "why")
     model = mujoco.MjModel.from_xml_path(str(loaded / "why" / "corrected.xml"))
@@ -118,9 +121,22 @@ def test_the_corrected_arm_is_the_whole_one_as_its_motors_move_it(loaded):
         np.testing.assert_allclose(torque, later.tau_motor[i], atol=10 * NOISE)
 
 
+@pytest.mark.slow
 def test_an_ensemble_is_of_the_whole_arm(loaded):
     """Load behind the drives, friction and rotors in them, each as far apart as it is off."""
     members, corrected = draw_ensemble(loaded / "why", count=24, seed=0), Corrected.load(loaded / "why")
+    told = [one for one in members.to_json()["effect_coefficients"] if one["effect"] == "coulomb_friction"]
+    found = [
+        c
+        for e, c in zip(corrected.effects, corrected.coefficients, strict=True)
+        if e.title == "coulomb_friction"
+    ]
+    assert len(told) == len(found) > 0
+    for one, (level,) in zip(told, found, strict=True):
+        low, middle, high = one["value"]
+        assert low < middle < high
+        assert low < float(level) < high
+        assert one["unit"] == "N·m"
     truths = {"coulomb_friction": COULOMB, "viscous_friction": VISCOUS, "armature": ROTORS}
     columns = iter(members.effects.T)
     for effect, coefficients in zip(corrected.effects, corrected.coefficients, strict=True):
@@ -133,6 +149,7 @@ def test_an_ensemble_is_of_the_whole_arm(loaded):
         assert 0 < first.std() < 0.02
 
 
+@pytest.mark.slow
 def test_the_motors_move_the_arm_in_a_replay(loaded):
     later = load(loaded / "later.csv")
     replays = [replay(loaded / "why", one, seconds=3.0) for one in (later, later.of_link_side())]
@@ -141,6 +158,7 @@ def test_the_motors_move_the_arm_in_a_replay(loaded):
     assert np.all(by_motors[LOSSY] < 0.3 * by_links[LOSSY])
 
 
+@pytest.mark.slow
 def test_where_nothing_is_missing_on_either_side_nothing_is_said():
     found = diagnose(None, [measured(3, drive=False)])
     assert isinstance(found, TwoSided)

@@ -19,7 +19,7 @@ from ..arms.export import ExportResult, panda_mjcf, write_parameters
 from ..arms.mjcf import MjcfSource, move_standard
 from ..arms.source import from_document, from_mjcf
 from ..corrected import Corrected
-from ..effects import AbstractJointEffect, Stretches, joint_columns
+from ..effects import AbstractEffect, AbstractJointEffect, Stretches, joint_columns
 from ..errors import InputError
 from ..files import Kind, finite, output_folder, settle, write_json, write_npz
 from ..friction import MODELS, Friction
@@ -197,6 +197,19 @@ class Ensemble:
                 out[:, int(name.rpartition("_")[2]) - 1] = self.extra[:, k]
         return out
 
+    def _of_effects(self) -> list[tuple[AbstractEffect, Float[np.ndarray, "count n"]]]:
+        """The effects of a diagnosis, with their coefficients in every member."""
+        if self.corrected is None:
+            return []
+        out = []
+        for i, (effect, mean) in enumerate(
+            zip(self.corrected.effects, self.corrected.coefficients, strict=True)
+        ):
+            drawn = self._is_drawn_rotor(i)
+            rotor = self.own("armature")[:, effect.joints[:1]]
+            out.append((effect, rotor if drawn else self._coefficients(i, np.asarray(mean))))
+        return out
+
     def band(
         self,
         motion: Recording,
@@ -262,15 +275,7 @@ class Ensemble:
         viscous, coulomb = (jnp.asarray(self.own(kind)[i]) for kind in ("viscous", "coulomb"))
         if self.corrected is None:
             return Corrected(self.arm, change, viscous, coulomb, (), ())
-        rotors = self.own("armature")[i]
-        coefficients = []
-        for k, (effect, mean) in enumerate(
-            zip(self.corrected.effects, self.corrected.coefficients, strict=True)
-        ):
-            value = self._coefficients(k, np.asarray(mean))[i]
-            if self._is_drawn_rotor(k):
-                value = rotors[[effect.joints[0]]]
-            coefficients.append(jnp.asarray(value))
+        coefficients = [jnp.asarray(values[i]) for _, values in self._of_effects()]
         return eqx.tree_at(
             lambda c: (c.change, c.damping_change, c.frictionloss_change, c.coefficients),
             self.corrected,
@@ -370,6 +375,17 @@ class Ensemble:
             "model_file": self.model_file or None,
             "friction": {"model": self.friction, "names": list(self.friction_names)},
             "effects": list(self.effect_names),
+            "effect_coefficients": [
+                {
+                    "effect": effect.title,
+                    "joints": [j + 1 for j in effect.joints],
+                    "name": of.name,
+                    "unit": effect.unit(of.unit, self.arm),
+                    "value": spread(x),
+                }
+                for effect, values in self._of_effects()
+                for of, x in zip(effect.coefficients, values.T, strict=True)
+            ],
             "corrected": None if self.corrected is None else self.corrected.to_json(),
             "noise": self.noise.tolist(),
             "mixing": {
