@@ -25,7 +25,7 @@ from jaxpanda.arms.source import from_document
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
 from jaxpanda.diagnosis.credible import is_event
-from jaxpanda.diagnosis.decide import titles
+from jaxpanda.diagnosis.decide import titles, worded
 from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
 from jaxpanda.diagnosis.knowledge import check, inertial_spread
 from jaxpanda.diagnosis.noise import autoregression, moments
@@ -132,6 +132,15 @@ def test_members_of_an_ensemble_differ_by_what_the_model_lacks(found):
     assert all(name.startswith("effect_") for name in plain.names)
     np.testing.assert_allclose(share, 0.5 * 0.3 / size, rtol=0.05)
     np.testing.assert_allclose(more[: -len(laws)], 0, atol=1e-9)
+
+
+def test_what_is_unlikely_is_said_to_be_so(found):
+    (finding,) = found.findings
+    assert finding.summary.startswith("The simulation is missing stribeck friction at joint 5: ")
+    unsure = dataclasses.replace(finding, confidence=0.3, alternatives=(("coulomb_friction", 0.2),))
+    said = worded(found.problem, found.kept, unsure).summary
+    assert said.startswith("The simulation may be missing stribeck friction at joint 5: ")
+    assert "could also mean coulomb friction" in said
 
 
 def test_the_heat_map_is_hottest_where_the_effect_was_concealed(found):

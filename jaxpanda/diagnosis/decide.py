@@ -1,5 +1,6 @@
 """From accepted terms to findings: merged, weighed against their rivals, and said in words."""
 
+import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -27,6 +28,8 @@ _TOUCHING = 0.15
 """Pause between events that happened at once [s]."""
 _LISTED = 0.01
 """Probability from which a rival is listed."""
+LIKELY, SURE = 0.5, 0.9
+"""Confidence from which a finding is said to be so, and from which its rivals need no mention."""
 DOUBTFUL = 0.2
 """Confidence below which what a finding stands for counts as not explained, where it is large."""
 REFITTED = 0.9
@@ -239,9 +242,6 @@ def _finding(
         ((n, sure * p) for n, p in rivals[clearest][1].items() if n not in same and sure * p >= _LISTED),
         key=lambda pair: -pair[1],
     )
-    equation, numbers = "; ".join(equations), [one for i in members for one in _corrected(problem, state, i)]
-    summary = _summary(name, joints, rms, intervals, names, alternatives, problem, own, equation, numbers)
-    summary = " ".join([summary, *dict.fromkeys(t.effect.remark for t in terms if t.effect.remark)])
     return Finding(
         effect=name,
         joints=joints,
@@ -249,17 +249,27 @@ def _finding(
         intervals=intervals,
         confidence=float(np.clip(own, 0.0, SUREST)),
         alternatives=tuple(alternatives[:4]),
-        equation=equation,
+        equation="; ".join(equations),
         parameters=tuple(parameters),
         rms_torque=rms,
         evidence=float(sum(rivals[i][0] for i in members)),
-        summary=summary,
+        summary="",
         terms=tuple(members),
         kind=getattr(terms[0].effect, "form", ""),
         own_family=effect.family,
         foretold=gained,
         torque_std=np.sqrt(variance),
     )
+
+
+def worded(problem: Problem, laws: State, finding: Finding) -> Finding:
+    """The same in sentences, which go by how sure it is; what is no law has its own."""
+    if not finding.terms:
+        return finding
+    remarks = dict.fromkeys(laws.terms[i].effect.remark for i in finding.terms)
+    numbers = [one for i in finding.terms for one in _corrected(problem, laws, i)]
+    said = [_summary(problem, finding, numbers), *(remark for remark in remarks if remark)]
+    return dataclasses.replace(finding, summary=" ".join(said))
 
 
 def foretold(problem: Problem, laws: State, groups: Sequence[Sequence[int]]) -> list[float]:
@@ -307,40 +317,43 @@ def _corrected(problem: Problem, state: State, i: int) -> list[Number]:
     return [(*one.of, one.value, max(one.value + float(values[k]), 0.0), unit(k)) for k, one in known.items()]
 
 
-def _wrong_number(numbers: Sequence[Number], strongest: int) -> tuple[str, str]:
+def _wrong_number(numbers: Sequence[Number], strongest: int, likely: bool) -> tuple[str, str]:
     """That a number of the user's model is wrong, and what it should be where that shows most."""
     ups = [new > old for _, _, old, new, _ in numbers]
     how = "too small" if all(ups) else "not this arm's" if any(ups) else "too large"
     where = next((one for one in numbers if one[1] == strongest), None)
     closing = "" if where is None else f", where {where[2]:.3g} should be {where[3]:.2g} {where[4]}"
-    return f"The simulation's {numbers[0][0]} is {how}", closing
+    return f"The simulation's {numbers[0][0]} {'is' if likely else 'may be'} {how}", closing
 
 
-def _summary(name, joints, rms, intervals, recordings, alternatives, problem, own, equation, numbers) -> str:
+def _summary(problem: Problem, finding: Finding, numbers: Sequence[Number]) -> str:
     """One or two plain sentences."""
+    name, joints, rms = finding.effect, finding.joints, finding.rms_torque
     strongest = int(np.argmax(rms))
     size = f"{rms[strongest]:.3g} {problem.arm.unit('N·m', strongest)} rms"
     if name == UNNAMED and len(joints) > 1:
         return (
             f"Joints {_listed(joints)} show up to {size}, at joint {strongest + 1}, that no named effect"
-            f" explains: {equation.split(': ')[-1]}."
+            f" explains: {finding.equation.split(': ')[-1]}."
         )
     if name == UNNAMED:
         return (
             f"Joint {strongest + 1} shows {size} that no named effect explains; it is"
-            f" fitted as a free curve ({equation.split(': ')[-1]})."
+            f" fitted as a free curve ({finding.equation.split(': ')[-1]})."
         )
     where = "" if len(joints) in (0, problem.dof) else f" at joint{'s' * (len(joints) > 1)} {_listed(joints)}"
     when = ""
-    if intervals is not None:
-        when = " in " + recordings[0] + " from " + ", ".join(f"{a:.2f} s to {b:.2f} s" for a, b in intervals)
-    opening, closing = f"The simulation is missing {name.replace('_', ' ')}", ""
+    if finding.intervals is not None:
+        times = ", ".join(f"{a:.2f} s to {b:.2f} s" for a, b in finding.intervals)
+        when = f" in {finding.recordings[0]} from {times}"
+    likely = finding.confidence >= LIKELY
+    opening, closing = f"The simulation {'is' if likely else 'may be'} missing {name.replace('_', ' ')}", ""
     if {at for _, at, *_ in numbers} == set(joints):
-        opening, closing = _wrong_number(numbers, strongest)
+        opening, closing = _wrong_number(numbers, strongest, likely)
     most = size if joints == (strongest,) else f"up to {size}, at joint {strongest + 1}"
     text = f"{opening}{where}{when}: {most}{closing}."
-    if alternatives and own < 0.9:
-        rival = alternatives[0][0]
+    if finding.alternatives and finding.confidence < SURE:
+        rival = finding.alternatives[0][0]
         cls = next(c for c in problem.catalogue if c.name == name)
         text += f" These recordings could also mean {rival.replace('_', ' ')}; {cls.reveals} would tell."
     return text

@@ -28,7 +28,7 @@ from . import knowledge as knowledge_
 from . import saved
 from .calibration import SMALL, are_told, calibrated, stands_out
 from .coverage import HeatMap, Least, heat_map, least_shown
-from .decide import DOUBTFUL, coefficients, findings, numbers, partly
+from .decide import DOUBTFUL, coefficients, findings, numbers, partly, worded
 from .finding import VERDICTS, Finding, Fit
 from .friction_shown import friction_shown
 from .localise import Localisation, localise, unbiased
@@ -39,7 +39,6 @@ from .problem import FOLDS, Problem, Term
 from .search import stand_ins, transferable
 from .state import State, with_terms
 from .uncertainty import polished
-from .unnamed import BEYOND
 from .written import buildable
 
 NEXT_MOTION = "next_motion.csv"
@@ -210,7 +209,8 @@ def sought(
     found = [*findings(problem, searched, state, laws, lost, fitted.missed), *wrong]
     more = partly(problem, state) or not all(_judged(problem))
     answer = verdict(found, fitted, more)
-    told, notes = calibrated(found, answer, fitted), list(premises.notes)
+    told = [worded(problem, laws, f) for f in calibrated(found, answer, fitted)]
+    notes = list(premises.notes)
     likely = are_told(told, fitted)
     if not all(likely):
         unsure = [f for f, on in zip(told, likely, strict=True) if not on]
@@ -253,7 +253,6 @@ def sought(
             *repairs,
             *(n for t in traces for n in _still(t)),
             *_unheard(problem),
-            *_turned(problem, state),
             *_as_recorded(corrected),
             *(n for t in traces for n in t.signals.notes),
         ),
@@ -326,19 +325,6 @@ def _still(trace: Trace) -> list[str]:
     return [
         f"{trace.name}: {named} never moved; friction at rest may carry any part of the load there, so that"
         " torque was not judged"
-    ]
-
-
-def _turned(problem: Problem, state: State) -> list[str]:
-    """A sentence about the joints whose known friction turns otherwise than MuJoCo's, beyond the noise."""
-    at = problem.known_off
-    torque = np.concatenate([N[:, :, at] @ state.design.x[at] for N in problem.nuisance])
-    joints = [str(j + 1) for j in np.flatnonzero(np.mean(torque**2, 0) > BEYOND * state.noise.std**2)]
-    if not joints:
-        return []
-    return [
-        f"the model's friction at joint{'s' * (len(joints) > 1)} {', '.join(joints)} turns over another range of"
-        " speeds than MuJoCo's constraint does, which is no finding (solreffriction and solimpfriction set it)"
     ]
 
 
