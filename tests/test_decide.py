@@ -572,3 +572,16 @@ def test_findings_that_are_not_sure_and_predict_poorly_explain_partly():
     assert verdict([found_as(effect, 0, 0.9), unsure[1]], poor, False) == "explained"
     assert verdict([], poor, False) == "consistent"
     assert verdict([found_as(effect, 0, 0.9)], worse, False) == "partly_explained"
+
+
+def test_a_joint_far_off_its_noise_is_told_though_what_fits_there_is_not(monkeypatch):
+    """A joint that was off seventeen times its noise was within noise in words, as the spring that fitted there
+    was hardly likely."""
+    monkeypatch.setattr("jaxpanda.diagnosis.diagnosis.are_told", lambda found, fit: [False] * len(found))
+    rubs = lambda t, q, qd, qdd: np.tanh(qd / 0.01) * np.eye(7)[3]
+    found = diagnose(None, [record(20, rubs)], knowledge="exact")
+    (finding,) = found.findings
+    assert (finding.effect, finding.joints, found.verdict) == ("unknown", (3,), "unexplained")
+    assert finding.confidence < 0.5
+    assert not found.corrected.effects
+    assert any("coulomb friction at joint 4" in note for note in found.notes)

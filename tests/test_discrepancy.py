@@ -13,7 +13,7 @@ from jaxpanda.diagnosis.events import swept
 from jaxpanda.diagnosis.evidence import Design, Noise
 from jaxpanda.diagnosis.premises import pose
 from jaxpanda.diagnosis.proposals import grids
-from jaxpanda.diagnosis.search import exchange, posterior, prune, search
+from jaxpanda.diagnosis.search import exchange, posterior, prune, remade, search
 from jaxpanda.diagnosis.state import (
     State,
     evidence,
@@ -334,6 +334,22 @@ def test_friction_that_holds_a_load_through_a_long_rest_is_friction_alone(held):
     problem = pose((prepare(resting(0.5, held), Arm.panda()),), (True,), "exact").problem
     (term,) = search(problem).terms
     assert (term.effect.family, term.effect.joints) == ("friction", (3,))
+
+
+def test_what_a_law_may_be_off_follows_what_it_explains(damped):
+    """A law taken in alone, whose torque others explain now, kept samples and columns that it might be off by for
+    that torque, and with them its place."""
+    c, std = np.array([3.0]), np.full(7, NOISE)
+    alone = damped.term(CoulombFriction(3, 0.01), c, c, std)
+    beside = damped.term(ViscousFriction(3), np.array([DAMPING]), np.array([DAMPING]), std)
+    state = with_terms(damped, [alone, beside])
+    found = remade(damped, state)
+    assert found.terms[1] is beside
+    left = found.design.x[places(found)[0]]
+    assert abs(left[0]) < 0.2 * c[0]
+    share = found.terms[0].at_rest.sum() / alone.at_rest.sum()
+    assert share < 4 * (left[0] / c[0]) ** 2 + 1e-9
+    assert remade(damped, found).terms == found.terms
 
 
 @pytest.mark.slow

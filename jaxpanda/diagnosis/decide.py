@@ -203,6 +203,8 @@ def _finding(
     covariance: Sequence[Float[np.ndarray, "_n _n"]],
     gained: float,
 ) -> Finding:
+    size = lambda i: float(np.linalg.norm(problem.weighed(torque(state, i))))
+    members = sorted(members, key=size, reverse=True)  # of two laws of one joint the larger comes first
     terms = [state.terms[i] for i in members]
     effect = next((t.effect for t in terms if t.effect.name == name), terms[0].effect)
     joints = tuple(sorted({j for t in terms for j in t.effect.joints}))

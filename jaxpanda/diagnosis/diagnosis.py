@@ -39,6 +39,7 @@ from .problem import FOLDS, Problem, Term
 from .search import stand_ins, transferable
 from .state import State, with_terms
 from .uncertainty import polished
+from .unnamed import standing_off
 from .written import buildable
 
 NEXT_MOTION = "next_motion.csv"
@@ -217,10 +218,13 @@ def sought(
         told = [f for f, on in zip(told, likely, strict=True) if on]
         notes.append(_too_unsure(unsure))
         more = more or any(stands_out(f, fitted) for f in unsure)
-        if not told:  # the user's model is as good as any
+        found = [f for f, on in zip(found, likely, strict=True) if on]
+        if not told:  # the user's model is as good as any, which need not be good
             kept = with_terms(problem, ())
             corrected, fitted = correct(kept), fit(problem, kept)
-        answer = verdict([f for f, on in zip(found, likely, strict=True) if on], fitted, more)
+            found = standing_off(problem, kept, ())
+            told = calibrated(found, verdict(found, fitted, more), fitted)
+        answer = verdict(found, fitted, more)
     if moved and not wrong:
         why = "to recordings of reference too" if beyond else f"as “{knowledge}” allows"
         notes.append(_refitted(arm, moved, why))

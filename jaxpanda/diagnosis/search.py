@@ -15,6 +15,7 @@ import scipy.special
 from ..effects import law_of
 from .alike import TEMPERATURE, joints_with, one_more, shared
 from .credible import fitted
+from .discrepancy import unresolved
 from .events import Proposal
 from .evidence import Design, Noise
 from .problem import Problem, Term
@@ -23,6 +24,7 @@ from .shapes import evidence_of, first_steps, refine
 from .state import (
     State,
     beside,
+    coefficients,
     evidence,
     gains,
     in_noise,
@@ -58,6 +60,9 @@ _CROWDED = 4
 """Terms from which another beginning is tried."""
 _OVERLAP, _FELT = 0.05, 0.02
 _SETTLED = 4
+_OTHERWISE, _REMADE = 2.0, 3
+"""By how much more or less than it was taken in with a law explains where what it may be off is made again; and
+how often, as each changes what the others explain."""
 
 
 def laws(problem: Problem, log: list[str] | None = None, terms: Sequence[Term] = ()) -> State:
@@ -250,6 +255,7 @@ def prune(problem: Problem, state: State, say: Any) -> State:
     """
     needed: set[int] = set()
     while True:
+        state = remade(problem, state)
         gained = gains(problem, state)
         for weakest in np.argsort(gained, kind="stable").tolist():
             term = state.terms[weakest]
@@ -477,6 +483,25 @@ def everywhere(problem: Problem, noise: Noise) -> list[Term]:
                 break
             terms += best[1]
     return terms
+
+
+def remade(problem: Problem, state: State) -> State:
+    """The model where each law may be off in proportion to what it explains beside the others, which may no more
+    be what it was taken in with."""
+    for _ in range(_REMADE):
+        terms = list(state.terms)
+        for i, term in enumerate(state.terms):
+            if term.unresolved is None:
+                continue
+            c = coefficients(state, i)
+            now = unresolved(problem.traces, [columns @ c for columns in term.columns])
+            grown = np.sqrt(now.sum() / max(float(term.unresolved.sum()), 1e-300))
+            if not 1 / _OTHERWISE < grown < _OTHERWISE:
+                terms[i] = problem.term(term.effect, term.deviation, c, state.noise.std, term.prior)
+        if all(new is old for new, old in zip(terms, state.terms, strict=True)):
+            break
+        state = with_terms(problem, terms)
+    return state
 
 
 def settle(problem: Problem, state: State, count: int = 1) -> State:

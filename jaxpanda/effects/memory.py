@@ -63,7 +63,8 @@ class PreslidingHysteresis(AbstractMemoryEffect):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        level = Coefficient("friction_level", "N·m", sign=1)
+        name = LEVEL.name if self._extent == "only" else "friction_level"
+        level = Coefficient(name, LEVEL.unit, sign=1)
         if self._law == "lugre":
             return level, Coefficient("micro_damping", "N·m·s/rad", sign=1)
         return (level, LEVEL) if self._extent == "whole" else (level,)
@@ -74,7 +75,7 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         if self._law == "jenkins":
             law = "dz = dq * dt / breakaway_distance, |z| <= 1"
         torque = {
-            "only": "friction_level * z",
+            "only": "coulomb * z",
             "extra": "friction_level * (z - sign(dq))",
             "whole": "friction_level * z + coulomb * sign(dq)",
         }[self._extent]
