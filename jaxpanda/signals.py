@@ -207,6 +207,8 @@ def white_noise(tau: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof"]
 
 def position_noise(q: Float[np.ndarray, "time dof"]) -> Float[np.ndarray, " dof"]:
     """Noise of q from sample to sample [rad], from the median of third differences: gaps do not count."""
+    if len(q) < 4:
+        return np.zeros(q.shape[1])
     return np.median(np.abs(np.diff(q, n=3, axis=0)), axis=0) / (0.6745 * np.sqrt(20))
 
 
