@@ -463,9 +463,8 @@ def _unit_verdicts(found: Inspection, arm: Arm | None) -> list[str]:
     scales = {j.joint: j.velocity_scale for j in found.joints if j.velocity_scale is not None}
     opposite = [joint for joint, scale in scales.items() if scale < -_OPPOSITE]
     if opposite:
-        said.append(
-            f"dq of joints {_listed(opposite)} has the opposite sign of d(q)/dt: velocities are taken from q"
-        )
+        which = f"joint{'s' * (len(opposite) > 1)} {_listed(opposite)}"
+        said.append(f"dq of {which} has the opposite sign of d(q)/dt: velocities are taken from q")
     lags = [joint.velocity_lag for joint in found.joints if joint.velocity_lag is not None]
     if lags and abs(np.median(lags)) > 2e-3:
         said.append(f"dq is {1e3 * np.median(lags):.1f} ms late behind d(q)/dt: velocities are taken from q")

@@ -185,7 +185,7 @@ def test_velocities_of_the_other_sign_are_told_as_such():
     assert recording.qd is not None
     signs = np.where(np.arange(7) == 2, -1.0, 1.0)
     found = inspect(dataclasses.replace(recording, qd=signs * recording.qd), Arm.panda())
-    assert "dq of joints 3 has the opposite sign of d(q)/dt" in said(found)
+    assert "dq of joint 3 has the opposite sign of d(q)/dt" in said(found)
     assert found.joints[2].velocity_scale == pytest.approx(-1.0, abs=0.02)
     as_it_was = inspect(recording, Arm.panda()).joints[2]
     assert found.joints[2].velocity_lag == pytest.approx(as_it_was.velocity_lag, abs=1e-9)
