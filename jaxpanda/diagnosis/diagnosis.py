@@ -26,7 +26,7 @@ from ..session import Say
 from ..traces import Trace, trajectory
 from . import knowledge as knowledge_
 from . import saved
-from .calibration import SMALL, are_told, calibrated, stands_out
+from .calibration import SMALL, TOLD, are_told, calibrated, stands_out
 from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly, worded
 from .finding import VERDICTS, Finding, Fit
@@ -219,12 +219,14 @@ def sought(
         notes.append(_too_unsure(unsure))
         more = more or any(stands_out(f, fitted) for f in unsure)
         found = [f for f, on in zip(found, likely, strict=True) if on]
-        if not told:  # the user's model is as good as any, which need not be good
-            kept = with_terms(problem, ())
-            corrected, fitted = correct(kept), fit(problem, kept)
+    if likely and not any(f.confidence >= TOLD for f in told):
+        # the user's model is as good as any, which need not be good
+        kept, more = with_terms(problem, ()), more or bool(told)
+        corrected, fitted = correct(kept), fit(problem, kept)
+        if not told:
             found = standing_off(problem, kept, ())
             told = calibrated(found, verdict(found, fitted, more), fitted)
-        answer = verdict(found, fitted, more)
+    answer = verdict(found, fitted, more)
     if moved and not wrong:
         why = "to recordings of reference too" if beyond else f"as “{knowledge}” allows"
         notes.append(_refitted(arm, moved, why))
