@@ -15,7 +15,7 @@ from helpers import record, to_mujoco
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose, predict
 from jaxpanda.diagnosis.credible import changes, is_of_time
-from jaxpanda.diagnosis.decide import findings, foretold
+from jaxpanda.diagnosis.decide import findings, foretold, worded
 from jaxpanda.diagnosis.diagnosis import Fit, verdict
 from jaxpanda.diagnosis.events import windows
 from jaxpanda.diagnosis.finding import Finding
@@ -543,7 +543,7 @@ def test_what_acts_along_a_joint_that_slides_is_told_in_newtons_and_metres():
     assert [p["unit"] for p in both.parameters] == ["N·m", "rad/s", "N", "m/s"]
     alone = with_terms(problem, terms[1:])
     slides, _ = findings(problem, alone, alone, alone, [False])  # and what the other joint is off
-    assert " N rms" in slides.summary
+    assert " N rms" in worded(problem, alone, slides).summary
 
 
 def found_as(effect, i, confidence):

@@ -262,7 +262,7 @@ def test_how_known_friction_turns_is_no_finding(v, tmp_path):
     rubs = lambda t, q, qd, qdd: 0.5 * np.tanh(qd / v)
     result = diagnose(model, [record(0, rubs), record(1, rubs)])
     assert result.verdict == "consistent", result.lines()
-    assert any("joint 7 turns" in note or "7 turns" in note for note in result.notes), result.notes
+    assert any("`predict` turns" in note and "at joint 7" in note for note in result.notes), result.notes
 
 
 PLANAR = """<mujoco><compiler angle="radian"/><worldbody><body>

@@ -46,7 +46,8 @@ class Condensed:
     def of(cls, regressions: Sequence[Regression], masks: Masks, rank: int) -> "Condensed":
         """The samples that masks leave."""
         weighed = triangles(regressions, masks)
-        plain = triangles(regressions, masks, weighted=False)
+        doubted = any(np.any(r.weight != 1) for r in regressions)
+        plain = triangles(regressions, masks, weighted=False) if doubted else weighed
         dof, columns = len(weighed), weighed.shape[2]
         extra = (columns - 1 - rank) // dof
         own = [
