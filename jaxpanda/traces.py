@@ -229,7 +229,8 @@ def trajectory(recording: Recording) -> Trajectory:
     position = _across_gaps(_splined(recording, time), rows, recording.q, time, rate)
     step = _written_in(recording)
     moved = smooth(position, step, rate, _most(rate))
-    return Trajectory(recording, signals, moved, *_pretended(position, step, moved.cutoff, rate))
+    noise = signals_.position_noise(position)
+    return Trajectory(recording, signals, moved, *_pretended(noise, step, moved.cutoff, rate))
 
 
 def _most(rate: float) -> float:
@@ -254,9 +255,9 @@ def prepare(recording: Recording, arm: Arm, *, coarse: float = WORK_RATE) -> Tra
     if noise is not None:
         cutoff_q = _cutoff_shown(recording, rough, position, arm, least, most)
     q, qd, qdd = continued_derivatives(position, cutoff_q, rate)
-    pretended = _pretended(position, _written_in(recording), cutoff_q, rate)
-    trace = _on_grids(recording, rough, keep, (q, qd, qdd), pretended, arm, (), coarse)
     noise_q = signals_.position_noise(position)
+    pretended = _pretended(noise_q, _written_in(recording), cutoff_q, rate)
+    trace = _on_grids(recording, rough, keep, (q, qd, qdd), pretended, arm, (), coarse)
     doubtful = signals_.unsure_sign(position, qd, qdd, noise_q, cutoff_q, rate)[keep]
     trace = dataclasses.replace(trace, unsure=doubtful, sharp=cutoff_q > least)
     if noise is None:
@@ -384,13 +385,12 @@ def _reversals(
 
 
 def _pretended(
-    position: Float[np.ndarray, "time dof"],
+    noise: Float[np.ndarray, " dof"],
     step: Float[np.ndarray, " dof"],
     cutoff: float | Float[np.ndarray, "time dof"],
     rate: float,
 ) -> tuple[Float[np.ndarray, "*time dof"], Float[np.ndarray, "*time dof"]]:
     """Speed and travel that noise of q, behind its low-pass, may pretend of a joint at rest [rad/s, rad]."""
-    noise = signals_.position_noise(position)
     travel = signals_.REST * noise * np.sqrt(2 * cutoff / rate) + 0.5 * step
     return signals_.REST * signals_.velocity_noise(noise, cutoff, rate), travel
 
