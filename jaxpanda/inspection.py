@@ -9,7 +9,7 @@ from jaxpanda_kernels import gravity_torque, regressor
 from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import maximum_filter1d
 
-from .arms.arm import Arm, unit_of
+from .arms.arm import Arm, joints_named, unit_of
 from .errors import require_x64
 from .meaning import Meaning, meaning
 from .parameters import triangle
@@ -463,8 +463,10 @@ def _unit_verdicts(found: Inspection, arm: Arm | None) -> list[str]:
     scales = {j.joint: j.velocity_scale for j in found.joints if j.velocity_scale is not None}
     opposite = [joint for joint, scale in scales.items() if scale < -_OPPOSITE]
     if opposite:
-        which = f"joint{'s' * (len(opposite) > 1)} {_listed(opposite)}"
-        said.append(f"dq of {which} has the opposite sign of d(q)/dt: velocities are taken from q")
+        said.append(
+            f"dq of {joints_named([j - 1 for j in opposite])} has the opposite sign of d(q)/dt: velocities are"
+            " taken from q"
+        )
     lags = [joint.velocity_lag for joint in found.joints if joint.velocity_lag is not None]
     if lags and abs(np.median(lags)) > 2e-3:
         said.append(f"dq is {1e3 * np.median(lags):.1f} ms late behind d(q)/dt: velocities are taken from q")

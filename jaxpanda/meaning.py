@@ -32,7 +32,7 @@ from jaxpanda_kernels import regressor
 from jaxtyping import Float, Int
 from threadpoolctl import threadpool_limits
 
-from .arms.arm import Arm
+from .arms.arm import Arm, joints_named
 from .convention import REMOVED, UNITS
 from .recordings import Recording
 from .signals import prepare
@@ -838,7 +838,7 @@ def _told(best: _Reading, model: _Model, confidence: float, gain: float) -> Mean
 def _words(best: _Reading, model: _Model, joints: np.ndarray) -> tuple[str, str, str]:
     """What the column is, the options that read it so, and what mends it."""
     dof = model.arm.dof
-    named = f"joint{'s' * (len(joints) > 1)} {', '.join(str(j + 1) for j in joints)}"
+    named = joints_named(joints.tolist())
     if best.kind == "gravity_removed":
         options = f"--gravity {REMOVED}"
         return (

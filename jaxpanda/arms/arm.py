@@ -190,6 +190,11 @@ def _unlisted(values: Sequence[Any], name: str) -> Sequence[Any]:
     return [missing if v is None else v for v in values]
 
 
+def joints_named(joints: Sequence[int]) -> str:
+    """`joint 3`, or `joints 1, 2`, of joints counted from 0."""
+    return f"joint{'s' * (len(joints) > 1)} {', '.join(str(j + 1) for j in joints)}"
+
+
 def unit_of(turning: str, prismatic: Iterable[bool]) -> str:
     """The unit that a number has at joints, some of which may slide, given the one that it has where they turn.
 

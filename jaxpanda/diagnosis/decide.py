@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..arms.arm import joints_named
 from ..effects import UNNAMED, law_of
 from .calibration import SUREST
 from .finding import Finding, joined
@@ -335,15 +336,15 @@ def _summary(problem: Problem, finding: Finding, numbers: Sequence[Number]) -> s
     size = f"{rms[strongest]:.3g} {problem.arm.unit('N·m', strongest)} rms"
     if name == UNNAMED and len(joints) > 1:
         return (
-            f"Joints {_listed(joints)} show up to {size}, at joint {strongest + 1}, that no named effect"
-            f" explains: {finding.equation.split(': ')[-1]}."
+            f"{joints_named(joints).capitalize()} show up to {size}, at joint {strongest + 1}, that no named"
+            f" effect explains: {finding.equation.split(': ')[-1]}."
         )
     if name == UNNAMED:
         return (
             f"Joint {strongest + 1} shows {size} that no named effect explains; it is"
             f" fitted as a free curve ({finding.equation.split(': ')[-1]})."
         )
-    where = "" if len(joints) in (0, problem.dof) else f" at joint{'s' * (len(joints) > 1)} {_listed(joints)}"
+    where = "" if len(joints) in (0, problem.dof) else f" at {joints_named(joints)}"
     when = ""
     if finding.intervals is not None:
         times = ", ".join(f"{a:.2f} s to {b:.2f} s" for a, b in finding.intervals)
@@ -359,7 +360,3 @@ def _summary(problem: Problem, finding: Finding, numbers: Sequence[Number]) -> s
         cls = next(c for c in problem.catalogue if c.name == name)
         text += f" These recordings could also mean {rival.replace('_', ' ')}; {cls.reveals} would tell."
     return text
-
-
-def _listed(joints: Sequence[int]) -> str:
-    return ", ".join(str(j + 1) for j in joints)

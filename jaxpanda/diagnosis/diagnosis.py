@@ -13,7 +13,7 @@ from jaxtyping import Float
 from .. import files
 from .. import signals as signals_
 from ..arms import markup
-from ..arms.arm import Arm
+from ..arms.arm import Arm, joints_named
 from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
 from ..corrected import KIND, Corrected
@@ -235,16 +235,15 @@ def sought(
         *(t for t in background if all(t is not k for k in lasting)),
     ]
     if left_out:
-        dropped = {t.effect.name.replace("_", " ") for t in left_out}
         notes.append(
             "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
-            f" or with all of the motion: {', '.join(sorted(dropped))}"
+            f" or with all of the motion: {_laws_named(left_out)}"
         )
     if doubtful:
-        where = ", ".join(str(j) for j in sorted({j + 1 for t in doubtful for j in t.effect.joints}))
+        where = joints_named(sorted({j for t in doubtful for j in t.effect.joints}))
         notes.append(
-            f"left out of the corrected model: the free curve at joint {where}, which leaves more than half of"
-            " what it is fitted to where it was not fitted"
+            f"left out of the corrected model: the free curve at {where}, which leaves more than half of what it"
+            " is fitted to where it was not fitted"
         )
     corrected = as_recorded(motions, buildable(source, corrected, problem), _judged(problem))
     repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
@@ -305,9 +304,17 @@ def _too_unsure(findings: Sequence[Finding]) -> str:
     """A sentence about findings that are not told."""
     each = []
     for f in findings:
-        where = f"joint{'s' * (len(f.joints) > 1)} {', '.join(str(j + 1) for j in f.joints)}"
-        each.append(f"{f.effect.replace('_', ' ')} at {where} ({f.confidence:.2f})")
+        each.append(f"{f.effect.replace('_', ' ')} at {joints_named(f.joints)} ({f.confidence:.2f})")
     return f"fits, but is hardly likely to be what is missing, and so no finding: {'; '.join(each)}"
+
+
+def _laws_named(terms: Sequence[Term]) -> str:
+    """Which laws, and of which joints."""
+    joints: dict[str, set[int]] = {}
+    for term in terms:
+        joints.setdefault(term.effect.name.replace("_", " "), set()).update(term.effect.joints)
+    where = {law: f" at {joints_named(sorted(of))}" if of else "" for law, of in joints.items()}
+    return "; ".join(law + where[law] for law in sorted(where))
 
 
 class _Log(list[str]):
@@ -324,13 +331,12 @@ class _Log(list[str]):
 
 def _still(trace: Trace) -> list[str]:
     """A sentence about the joints that stand still in a recording."""
-    joints = [str(j + 1) for j in np.flatnonzero(~trace.trust.any(0))]
+    joints = np.flatnonzero(~trace.trust.any(0)).tolist()
     if not joints:
         return []
-    named = f"joint{'s' * (len(joints) > 1)} {', '.join(joints)}"
     return [
-        f"{trace.name}: {named} never moved; friction at rest may carry any part of the load there, so that"
-        " torque was not judged"
+        f"{trace.name}: {joints_named(joints)} never moved; friction at rest may carry any part of the load"
+        " there, so that torque was not judged"
     ]
 
 
@@ -363,11 +369,11 @@ def _judged(problem: Problem) -> list[bool]:
 def _unheard(problem: Problem) -> list[str]:
     """A sentence about the joints that move, but of which too few samples count."""
     moving = np.any([t.weights.any(0) for t in problem.traces], 0)
-    joints = [str(j + 1) for j in range(problem.dof) if moving[j] and not problem.saturation.tells(j)]
+    joints = [j for j in range(problem.dof) if moving[j] and not problem.saturation.tells(j)]
     if not joints:
         return []
     return [
-        f"too few samples of joint{'s' * (len(joints) > 1)} {', '.join(joints)} can be used to tell physics from"
+        f"too few samples of {joints_named(joints)} can be used to tell physics from"
         " noise, so that torque was not judged there"
     ]
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import summaries
-from ..arms.arm import Arm
+from ..arms.arm import Arm, joints_named
 from ..effects import AbstractEffect
 from ..report import Figure, Listing, Section, Table, number
 from ..versions import version
@@ -200,7 +200,7 @@ def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -
 def _at(joints: Sequence[int], dof: int) -> str:
     if not joints or len(joints) == dof:
         return ""
-    return f" at joint{'s' * (len(joints) > 1)} {', '.join(str(j + 1) for j in joints)}"
+    return f" at {joints_named(joints)}"
 
 
 def _plain(name: str) -> str:

@@ -17,6 +17,7 @@ import scipy.ndimage
 from jaxtyping import Float
 from scipy.signal.windows import hann
 
+from ..arms.arm import joints_named
 from ..effects import UNNAMED, may_carry
 from ..signals import Signals, white_noise
 from ..traces import Trace
@@ -189,10 +190,9 @@ def stuck(problem: Problem, std: Float[np.ndarray, " dof"]) -> Finding | None:
         equation="tau = constant",
         rms_torque=rms,
         evidence=float(0.5 * np.sum((error / std) ** 2)),
-        summary=f"The measured torque of joint{'s' * (len(joints) > 1)} "
-        f"{', '.join(str(j + 1) for j in joints)} is stuck in {trace.name}, first from {when[0][0]:.2f} s to"
-        f" {when[0][1]:.2f} s, while the arm moves: a sensor that repeats itself or is at its limit. What it gave"
-        " then was not used.",
+        summary=f"The measured torque of {joints_named(joints)} is stuck in {trace.name}, first from"
+        f" {when[0][0]:.2f} s to {when[0][1]:.2f} s, while the arm moves: a sensor that repeats itself or is at"
+        " its limit. What it gave then was not used.",
     )
 
 
@@ -238,8 +238,7 @@ def hum(
         ),
         rms_torque=rms,
         evidence=sum(0.5 * (line.amplitude / line.deviation) ** 2 for _, x in same for line in x.values()),
-        summary=f"The measured torque of joint{'s' * (len(loudest) > 1)} "
-        f"{', '.join(str(j + 1) for j in loudest)} hums at "
+        summary=f"The measured torque of {joints_named([*loudest])} hums at "
         f"{clearest.frequency:.2f} Hz whatever the arm does, with up to {np.sqrt(2) * rms.max():.2g} N·m.",
     )
 
