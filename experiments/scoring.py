@@ -1,6 +1,8 @@
 """More figures of a blind trial: what is said at which joint, how sure, and what it does to a prediction.
 
-    python scoring.py --cases DIR --out ANSWERS
+    python scoring.py --cases DIR ... --out ANSWERS ...
+
+With several folders of cases, and as many of their answers, the figures are those of all together.
 
 Reads the truths and the answers that `concealed/score.py` leaves (which prints these figures too). A *place* is
 an effect at a joint; effects of the whole arm have one place without a joint. Truths count for recall where they
@@ -34,6 +36,7 @@ EVERYWHERE = WHOLE | {"torque_meaning"}
 SURE = 0.9
 MISSED = 1.5  # times the noise: what an `explained` verdict may not leave out
 BINS = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
+DRAWN = 500
 
 
 @dataclass(frozen=True)
@@ -228,6 +231,15 @@ def calibration_error(findings: list[tuple[float, bool]]) -> float | None:
     return float(sum(n * abs(said - right) for _, _, n, said, right in reliability(findings)) / len(findings))
 
 
+def calibration_error_by_chance(findings: list[tuple[float, bool]]) -> float | None:
+    """What the calibration error is in the mean where confidence is right: shares of few findings scatter."""
+    if not findings:
+        return None
+    sure, rng = [c for c, _ in findings], np.random.default_rng(0)
+    drawn = rng.random((DRAWN, len(sure))) < sure
+    return float(np.mean([calibration_error(list(zip(sure, right, strict=True))) for right in drawn]))
+
+
 def share(part: float, whole: float) -> float | None:
     return part / whole if whole else None
 
@@ -245,6 +257,7 @@ def figures(results: list[dict]) -> dict[str, tuple[float | None, int]]:
     sure = [right for c, right in findings if c >= SURE]
     table["right of the claims at 0.9 or more"] = (share(sum(sure), len(sure)), len(sure))
     table["expected calibration error"] = (calibration_error(findings), len(findings))
+    table["... if confidence were right"] = (calibration_error_by_chance(findings), len(findings))
     brier = float(np.mean([(c - r) ** 2 for c, r in findings])) if findings else None
     table["Brier score, all findings"] = (brier, len(findings))
     nulls = [bool(r["findings"]) for r in results if r["null"]]
@@ -317,18 +330,34 @@ def report(cases: list[Path], out: Path) -> str:
     return text
 
 
+def answered(cases: Path, out: Path) -> list[Path]:
+    """The cases of a folder that have an answer."""
+    found = sorted(path.parent for path in cases.glob("*/truth.json"))
+    found = [case for case in found if (out / case.name / "run.json").exists()]
+    if not found:
+        raise SystemExit(f"no answers to {cases} in {out}")
+    return found
+
+
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--cases", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--cases", type=Path, nargs="+", required=True)
+    parser.add_argument("--out", type=Path, nargs="+", required=True)
     args = parser.parse_args()
-    cases = sorted(path.parent for path in args.cases.glob("*/truth.json"))
-    cases = [case for case in cases if (args.out / case.name / "run.json").exists()]
-    if not cases:
-        raise SystemExit(f"no answers to {args.cases} in {args.out}")
-    print(report(cases, args.out))
+    if len(args.cases) != len(args.out):
+        parser.error(f"{len(args.cases)} folders of cases and {len(args.out)} of answers")
+    pairs = list(zip(args.cases, args.out, strict=True))
+    if len(pairs) == 1:
+        (cases, out), *_ = pairs
+        print(report(answered(cases, out), out))
+    else:
+        print(
+            as_text(
+                [judge_case(case, out / case.name) for cases, out in pairs for case in answered(cases, out)]
+            )
+        )
 
 
 if __name__ == "__main__":
