@@ -317,7 +317,9 @@ def _on_grids(
         return scipy.interpolate.CubicSpline(motion.time, x)(np.clip(time[fine], *motion.time[[0, -1]]))
 
     load, shown = finely(motion.load), None if tau is None else finely(tau)
-    channels = Channels(time[fine], q[fine], qd[fine] * travels, qdd[fine], load, load + held_fine, shown)
+    channels = Channels(
+        time[fine], q[fine], qd[fine] * travels, qdd[fine], load, load + held_fine, shown, sign
+    )
     weight = _weight(recording.time, time[keep], rate)
     trust = np.ones(motion.q.shape)
     return Trace(recording.name, signals, channels, dt, motion, tau, weight, kept, cutoff, sign, trust)

@@ -16,7 +16,7 @@ from jaxpanda.diagnosis.diagnosis import _unheard
 from jaxpanda.diagnosis.evidence import Noise, levelled
 from jaxpanda.diagnosis.noise import DETAILS, borne_out
 from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.state import _levelled_squares, beyond, slow_errors, start
+from jaxpanda.diagnosis.state import _levelled_squares, beyond, mean_squares, slow_errors, start
 from jaxpanda.traces import prepare
 
 ARM = Arm.panda()
@@ -136,6 +136,23 @@ def test_what_a_joint_holds_that_sticks_is_no_noise():
     np.testing.assert_allclose(noise(1.0), noise(0.0), rtol=0.5)
 
 
+@pytest.mark.parametrize(("seed", "level"), [(3, 1.0), (4, 0.3)])
+def test_rests_do_not_dilute_what_a_model_leaves_while_its_joint_moves(seed, level):
+    """Half of the time friction may hold any load, and samples weigh next to nothing: of what a right model left
+    the mean square had been half of the noise's, and errors of a wrong one were not seen."""
+    rubs = dataclasses.replace(ARM, frictionloss=jnp.zeros(ARM.dof).at[3].set(level))
+    problem = pose((prepare(stop_and_go(seed, level), rubs),), (True,), "exact").problem
+    state = start(problem)
+    assert state.counts[3] < 0.5 * state.counts[4]
+    np.testing.assert_allclose(mean_squares(problem, problem.noise(()), (), state.design.x), 1.0, atol=0.2)
+
+
+def test_what_is_beyond_noise_is_told_by_the_samples_that_tell():
+    weight = np.where(np.arange(4000) < 2500, 0.02, 1.0)
+    left = 1.5 * weight * np.random.default_rng(0).normal(size=4000)
+    assert beyond([left], [weight**2], 0.02).scale == pytest.approx(1.5, rel=0.1)
+
+
 @pytest.mark.parametrize("shape", slow_errors(0.02))
 def test_whitening_undoes_what_makes_noise_slow(shape):
     pole, zero = shape
@@ -156,7 +173,7 @@ def test_the_likeliest_slow_error_is_that_of_the_least_innovations(count):
     squares = [np.sum(levelled(y, slow)[0] ** 2) for slow in slow_errors(0.02)]
     np.testing.assert_allclose(_levelled_squares(y, 0.02), squares, rtol=1e-9)
     assert not slow_errors(1.5)  # at samples so far apart none is told
-    assert beyond([2.0 * y], 1.5).slow == (0.0, 0.0)
+    assert beyond([2.0 * y], [np.ones(count)], 1.5).slow == (0.0, 0.0)
 
 
 def test_a_slow_error_of_the_model_is_seen_where_there_is_one():

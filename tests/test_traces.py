@@ -302,6 +302,19 @@ def test_known_friction_turns_as_mujoco_has_it_turn(joint, before, tmp_path):
     np.testing.assert_allclose(np.asarray(arm.frictionloss) * share, friction, atol=1e-5)
 
 
+def test_bristles_in_the_place_of_known_friction_take_off_what_the_model_has_of_it():
+    """MuJoCo's constraint creeps, on a light joint at any speed: bristles took off a sign of the velocity."""
+    rubs = dataclasses.replace(Arm.panda(), frictionloss=jnp.full(7, 2.0))
+    trace = prepare(record(0), rubs)
+    held, moving = trace.channels.held, np.abs(trace.channels.qd[:, 6]) > 0.05
+    assert np.median(np.abs(held[moving, 6])) < 0.5
+    only, extra = (
+        joint_columns([PreslidingHysteresis(6, 0.01, f"dahl {extent}")], trace.stretches, trace.dt)[:, 0, 0]
+        for extent in ("only", "extra")
+    )
+    np.testing.assert_allclose(held[:, 6] + extra, only, atol=1e-12)
+
+
 def test_friction_of_an_arm_that_has_no_mass_is_refused():
     arm = dataclasses.replace(Arm.panda(), standard=jnp.zeros((7, 10)), armature=jnp.zeros(7))
     with pytest.raises(InputError, match="mass matrix is singular"):

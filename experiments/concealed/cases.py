@@ -638,6 +638,8 @@ class Case:
             "effects": entries,
             "noise_std": _digits(self.noise_std),
             "nominal": self.nominal_kind,
+            # links of a rough model are off, in every recording
+            "allowed": ["inertial_parameters"] if self.nominal_kind == "rough" else [],
             "family": self.family,
             "sensors": self.sensors,
             "stratum": self.plan.stratum,

@@ -187,10 +187,8 @@ def sought(
     laws = _fitted_laws(problem, state)
     guessed = premises.knowledge not in ("exact", "identified")
     moved = numbers(problem, state, premises.changes) if guessed else []
-    # within what is known of them, or by an identification with a poorer motion, they are no finding; nor are
-    # they news beside recordings of reference, to which they were refitted with the others
-    beyond = (premises.knowledge, premises.scale) != (knowledge, 1.0)
-    wrong = moved if beyond and all(active) else []
+    # beside recordings of reference, to which they were refitted with the others, they are no news
+    wrong = moved if all(active) else []
     kept = transferable(problem, laws)
     if doubtful := stand_ins(problem, kept):
         kept = with_terms(problem, [t for t in kept.terms if all(t is not d for d in doubtful)])
@@ -228,8 +226,7 @@ def sought(
             told = calibrated(found, verdict(found, fitted, more), fitted)
     answer = verdict(found, fitted, more)
     if moved and not wrong:
-        why = "to recordings of reference too" if beyond else f"as “{knowledge}” allows"
-        notes.append(_refitted(arm, moved, why))
+        notes.append(_refitted(arm, moved))
     left_out = [
         *(t for t, gone in zip(state.terms, lost, strict=True) if gone),
         *(t for t in background if all(t is not k for k in lasting)),
@@ -290,14 +287,14 @@ def _fitted_laws(problem: Problem, state: State) -> State:
     return polished(problem, with_terms(problem, terms))
 
 
-def _refitted(arm: Arm, moved: Sequence[Finding], why: str) -> str:
-    """A sentence about numbers of the model that are no finding, and why."""
+def _refitted(arm: Arm, moved: Sequence[Finding]) -> str:
+    """A sentence about numbers of the model that healthy recordings had refitted too, and so are no finding."""
     each = []
     for f in moved:
         j = max(f.joints, key=lambda j: f.rms_torque[j])
         size = f"{f.rms_torque[j]:.3g} {arm.unit('N·m', j)} rms"
         each.append(f"{f.effect.replace('_', ' ')}, by up to {size} at joint {j + 1}")
-    return f"numbers of the model were refitted {why}: {'; '.join(each)}"
+    return f"numbers of the model were refitted to recordings of reference too: {'; '.join(each)}"
 
 
 def _too_unsure(findings: Sequence[Finding]) -> str:

@@ -418,7 +418,7 @@ def _placed(
         motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], friction[keep])
         load = scipy.interpolate.CubicSpline(motion.time, motion.load)(np.clip(time, *motion.time[[0, -1]]))
         torque = load + friction
-        channels = Channels(time, q, qd, qdd, load, torque, torque)
+        channels = Channels(time, q, qd, qdd, load, torque, torque, sign)
         weight = np.ones(len(keep))
         new = Trace(
             "next",

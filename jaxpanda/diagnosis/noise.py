@@ -167,10 +167,15 @@ class Saturation:
             holds: that of a load which friction may hold: nothing is borne out there.
 
         Of white noise of variance $\sigma^2$ a model with orthonormal columns U takes
-        $\sigma^2 \sum_t U_{t-k} \cdot U_{t-l}$ of the moment of lags k and l: most where it is slow.
+        $\sigma^2 \sum_t U_{t-k} \cdot U_{t-l}$ of the moment of lags k and l: most where it is slow. Samples that
+        all weigh little, as of a joint that hardly ever moves, have no less noise: weights are such that those
+        that tell, $(\sum w^2)^2 / \sum w^4$, have it in full.
         """
         r, bases = self.left(joint, extra)
         basis = self._basis(joint)
+        squares = self._weight(joint) ** 2
+        unit = basis.count / max(float(np.sum(squares)), 1e-300)
+        r = r * np.sqrt(unit)
         taken = sum((self.moments(V) for V in bases[1:]), basis.taken)
         count, used = basis.count, sum(U.shape[1] for U in bases)
         variance = float(r @ r) / max(count - used, LEAST_FREE * count)
@@ -178,7 +183,7 @@ class Saturation:
         sigma, std = np.maximum(noise, self._resolved[joint]).tolist()
         b = np.concatenate([[1.0], -a])
         left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)]) / sigma
-        counts = self._weight(joint) ** 2 * (left != 0) * (holds == 0)
+        counts = unit * squares * (left != 0) * (holds == 0)
         share, scale = borne_out(left, off / std**2, counts)
         left /= scale * np.sqrt(1 + share * off / std**2)
         free = rests * (1 - sum(np.sum(U**2, 1) for U in bases))

@@ -246,6 +246,16 @@ class Problem:
         """What the samples of a recording weigh in a joint."""
         return self.traces[r].weights[:, joint] * noise.trusted(self.rows[r], joint)
 
+    def counts(self, noise: Noise, r: int, joint: int) -> Float[np.ndarray, " _time"]:
+        """Mean square of weighted innovations that are noise, of the samples of a recording in a joint: little
+        where it may rest, held at any load by friction, as samples scatter no more there for what they weigh."""
+        rows, own = self.rows[r], self.traces[r].weights[:, joint]
+        if noise.at_rest is not None:
+            own = own * np.sqrt(1 - noise.at_rest[rows, joint] * noise.trusted(rows, joint) ** 2)
+        out = own**2
+        out[: noise.a.shape[1]] = 0.0
+        return out
+
     @functools.cached_property
     def rows(self) -> list[slice]:
         """Where each recording's samples are, all one below the other."""

@@ -22,6 +22,8 @@ class State:
     design: Design
     joints: int
     """How many tell of themselves."""
+    counts: Float[np.ndarray, " dof"]
+    """How many samples of a joint do, by `Problem.counts`."""
 
     @functools.cached_property
     def shares(self) -> Float[np.ndarray, "terms dof"]:
@@ -41,7 +43,7 @@ class State:
         counted = 0.0
         for j, r in enumerate(self.design.residual):
             here = r != 0
-            counted += 0.5 * float(r @ r) + np.count_nonzero(here) * float(np.log(self.noise.sigma[j]))
+            counted += 0.5 * float(r @ r) + self.counts[j] * float(np.log(self.noise.sigma[j]))
             counted += self.noise.widened(j, here)
         return self.design.log_evidence - counted + paid(self.terms, self.joints)
 
@@ -73,7 +75,9 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
     # what a fit leaves depends on the noise it was made in: that of the last model, and none that is unexplained
     starts = (*problem.beyond_noise, (Beyond(),) * problem.dof)
     x = [widened(start).design.x for start in starts]
-    left = [[beyond(y, dt) for y in left_over(problem, noise, terms, c)] for c in x]
+    counts = [counted(problem, noise, j) for j in range(problem.dof)]
+    each = [left_over(problem, noise, terms, c) for c in x]
+    left = [[beyond(y, n, dt) for y, n in zip(of_joints, counts, strict=True)] for of_joints in each]
     least = tuple(min(of_joint, key=lambda b: b.left) for of_joint in zip(*left, strict=True))
     problem.beyond_noise[:] = [least]
     return widened(least)
@@ -93,6 +97,11 @@ def left_over(
         left = enumerate(misfit(problem, terms, x, j))
         out.append([noise.weighted(y, j, problem.weights(noise, r, j), problem.rows[r]) for r, y in left])
     return out
+
+
+def counted(problem: Problem, noise: Noise, joint: int) -> list[Float[np.ndarray, " _time"]]:
+    """Of each recording, `Problem.counts`."""
+    return [problem.counts(noise, r, joint) for r in range(len(problem.traces))]
 
 
 def misfit(
@@ -123,11 +132,16 @@ class Beyond:
     """Twice the nats that a sample of them costs beside that."""
 
 
-def beyond(left: Sequence[Float[np.ndarray, " _time"]], dt: float) -> Beyond:
+def beyond(
+    left: Sequence[Float[np.ndarray, " _time"]], counts: Sequence[Float[np.ndarray, " _time"]], dt: float
+) -> Beyond:
     """The slow error, if what is left is beyond the noise, with which a joint's innovations are smallest; its two
-    numbers must be worth it (Schwarz 1978)."""
-    best, shape = float(np.log(max(_mean_square(np.concatenate(left)), 1e-300))), (0.0, 0.0)
-    count = max(sum(map(np.count_nonzero, left)), 2)
+    numbers must be worth it (Schwarz 1978).
+
+    `counts`: mean square of what is left where it is noise.
+    """
+    best, shape = float(np.log(max(_mean_square(left, counts), 1e-300))), (0.0, 0.0)
+    count = max(float(sum(map(np.sum, counts))), 2.0)
     if best > 0 and (tried := slow_errors(dt)):
         squares = sum(_levelled_squares(part[rows], dt) for part in left for rows in stretches(part != 0))
         found = np.log(squares / count) + 2 * np.log(count) / count
@@ -181,7 +195,8 @@ def _responses(dt: float, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def in_noise(problem: Problem, terms: Sequence[Term], noise: Noise) -> State:
     """The model with these terms, in some noise."""
-    return State(tuple(terms), noise, problem.design(terms, noise), problem.telling)
+    counts = np.array([sum(map(np.sum, counted(problem, noise, j))) for j in range(problem.dof)])
+    return State(tuple(terms), noise, problem.design(terms, noise), problem.telling, counts)
 
 
 def places(state: State) -> list[slice]:
@@ -221,18 +236,32 @@ def evidence(problem: Problem, terms: Sequence[Term], design: Design, noise: Noi
     Where a joint has errors beyond the saturated model's noise their size is not known, and falls with what is
     explained: there $-\tfrac12 \sum e^2$ gives way to $-\tfrac n2 \log s^2$ in the noise that is left.
     """
-    if noise.least is None:
+    uneven = (
+        []
+        if noise.least is None
+        else [j for j in range(problem.dof) if noise.has_slow(j) or noise.sigma[j] > noise.least[j]]
+    )
+    if not uneven:
         return design.log_evidence
-    plain = dataclasses.replace(noise, sigma=noise.least, slow=None)
-    uneven = [j for j in range(problem.dof) if noise.has_slow(j) or noise.sigma[j] > noise.least[j]]
-    gained, dt = 0.0, problem.traces[0].motion.dt
-    for j, parts in zip(uneven, left_over(problem, plain, terms, design.x, uneven), strict=True):
-        count = sum(map(np.count_nonzero, parts))
-        as_is = np.concatenate([noise.level(part, j, part != 0) for part in parts])
-        as_is *= plain.sigma[j] / noise.sigma[j]
-        wider = np.log(noise.sigma[j] / plain.sigma[j])
-        gained += 0.5 * float(as_is @ as_is) + count * (wider - 0.5 * beyond(parts, dt).left)
-    return design.log_evidence + gained
+    plain, dt = dataclasses.replace(noise, sigma=noise.least, slow=None), problem.traces[0].motion.dt
+    counts = {j: counted(problem, noise, j) for j in uneven}
+
+    def told(fitted: Design, wide: Noise) -> float:
+        out = fitted.log_evidence
+        for j, parts in zip(uneven, left_over(problem, plain, terms, fitted.x, uneven), strict=True):
+            as_is = np.concatenate([wide.level(part, j, part != 0) for part in parts])
+            as_is *= plain.sigma[j] / wide.sigma[j]
+            r, count = fitted.residual[j], float(sum(map(np.sum, counts[j])))
+            out += 0.5 * (float(as_is @ as_is - r @ r) - count * beyond(parts, counts[j], dt).left)
+        return out
+
+    # a fit among slow errors does not see what is slow
+    best = max(told(design, noise), told(problem.design(terms, plain), plain))
+    wider = {j: float(np.log(noise.sigma[j] / plain.sigma[j])) for j in uneven}
+    return best + sum(
+        0.5 * float(np.sum(design.residual[j] ** 2)) + float(sum(map(np.sum, counts[j]))) * wider[j]
+        for j in uneven
+    )
 
 
 def likelier(a: tuple[Problem, State], b: tuple[Problem, State]) -> float:
@@ -298,12 +327,15 @@ def mean_squares(
     problem: Problem, noise: Noise, terms: Sequence[Term], x: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " dof"]:
     """Of what a model leaves of each joint, whitened by a saturated model's noise: 1 where it is noise."""
-    return np.array([_mean_square(np.concatenate(left)) for left in left_over(problem, noise, terms, x)])
+    left = left_over(problem, noise, terms, x)
+    return np.array([_mean_square(y, counted(problem, noise, j)) for j, y in enumerate(left)])
 
 
-def _mean_square(left: Float[np.ndarray, " rows"]) -> float:
-    """Of what is left of a joint, whitened; rows that do not count are zero."""
-    return float(np.sum(left**2)) / max(np.count_nonzero(left), 1)
+def _mean_square(
+    left: Sequence[Float[np.ndarray, " _time"]], counts: Sequence[Float[np.ndarray, " _time"]]
+) -> float:
+    """Of what is left of a joint in each recording, whitened, over that of noise."""
+    return float(sum(y @ y for y in left)) / max(float(sum(map(np.sum, counts))), 1.0)
 
 
 _LASTING, _LARGER = (0.5, 2.0), 2.0

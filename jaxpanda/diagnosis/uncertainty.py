@@ -28,7 +28,7 @@ from .evidence import Design
 from .noise import autoregression, moments
 from .problem import Problem, Term
 from .shapes import first_steps, moved, within
-from .state import State, coefficients, places, torque
+from .state import State, coefficients, in_noise, places, torque
 
 _STEP_LOG, _STEP_SHARE, _STEP_TIME = 0.02, 0.002, 0.01
 """Steps of the differences: of a logarithm, as a share of the bounds, and of an instant [s]."""
@@ -110,7 +110,7 @@ def _moved(problem: Problem, state: State, near: Linearised, step: Float[np.ndar
         _reshaped(problem, t, within(problem, moved(t.effect, steps[i]))) if i in steps else t
         for i, t in enumerate(state.terms)
     ]
-    return State(tuple(terms), state.noise, problem.design(terms, state.noise), state.joints)
+    return in_noise(problem, terms, state.noise)
 
 
 def _reshaped(problem: Problem, term: Term, effect: AbstractEffect) -> Term:

@@ -35,8 +35,9 @@ class PreslidingHysteresis(AbstractMemoryEffect):
     Dahl's form, $\tau_j = F_c z$ with $dz = (\mathrm{sign}(\dot q) - z)\,|\dot q|\,dt / x_s$, and the Jenkins
     element of Maxwell-slip models, $dz = \dot q\,dt / x_s$ with $|z| \le 1$. LuGre's form adds to Dahl's what
     the bristles' own rate damps, $\sigma_1 x_s \dot z = \sigma_1 (\dot q - z |\dot q|)$. Form "... extra" has
-    $z - \tanh(\dot q / v_0)$, for a joint whose model holds Coulomb friction at its full level already;
-    "... whole" has both levels free.
+    $z - s$, for a joint whose model holds Coulomb friction at its full level already, with s the share at which
+    the model has it: MuJoCo's constraint creeps, on a light joint far from a sign of the velocity
+    (`traces.held_sign`). "... whole" has both levels free.
 
     References:
         Dahl 1968; Canudas de Wit, Olsson, Åström, Lischinsky, IEEE TAC 1995, eqs. 1 to 3; Al-Bender, Lampaert,
@@ -76,7 +77,7 @@ class PreslidingHysteresis(AbstractMemoryEffect):
             law = "dz = dq * dt / breakaway_distance, |z| <= 1"
         torque = {
             "only": "coulomb * z",
-            "extra": "friction_level * (z - sign(dq))",
+            "extra": "friction_level * (z - sign(dq) as the model turns it)",
             "whole": "friction_level * z + coulomb * sign(dq)",
         }[self._extent]
         if self._law == "lugre":
@@ -133,7 +134,8 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         if self._law == "lugre":
             return z, jnp.concatenate([z, qd - z * jnp.abs(qd)])
         sign = smooth_sign(qd, _WIDTH)[None]
-        return z, {"only": z, "extra": z - sign, "whole": jnp.concatenate([z, sign])}[self._extent]
+        held = sign if s.held is None else s.held[self.joint][None]
+        return z, {"only": z, "extra": z - held, "whole": jnp.concatenate([z, sign])}[self._extent]
 
     @property
     def _law(self) -> str:

@@ -30,6 +30,8 @@ class Channels(eqx.Module):
     """Torque of the nominal model with the friction that recordings show, as sensors scale and delay it [N m]."""
     shown: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"] | None = None
     """Torque that the sensors show [N m]; None where they tell nothing, and the model's is the best there is."""
+    held: Float[Array, "*time dof"] | Float[np.ndarray, "*time dof"] | None = None
+    """Share of its level at which the model's Coulomb friction stands, -1 to 1; None where laws take it over."""
 
 
 class Motion:
