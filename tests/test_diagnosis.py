@@ -267,7 +267,8 @@ def test_how_known_friction_turns_is_no_finding(v, tmp_path):
 
 @pytest.mark.slow
 def test_bristles_are_found_where_the_model_s_constraint_creeps(tmp_path):
-    """On a light joint it is far from a sign of the velocity, by which bristles were told from it."""
+    """On a light joint it is far from a sign of the velocity, by which bristles were told from it. And where the
+    joint came from nobody has recorded: as a law of the whole recording that was a drift and a free curve."""
     model = tmp_path / "rubs.xml"
     model.write_text(panda_mjcf().replace('<joint name="joint7"', '<joint name="joint7" frictionloss="4"'))
 
@@ -278,13 +279,13 @@ def test_bristles_are_found_where_the_model_s_constraint_creeps(tmp_path):
         return out
 
     result = diagnose(model, [record(0, bristles), record(1, bristles)])
+    assert result.verdict == "explained"
     (found,) = result.findings
     assert (found.effect, found.joints) == ("presliding_hysteresis", (6,))
-    assert found.confidence > 0.8
+    assert found.confidence > 0.9
     told = {p["name"]: p["value"] for p in found.parameters}
-    assert told["friction_level"] == pytest.approx(4.0, rel=0.05)
-    assert told["breakaway_distance"] == pytest.approx(0.03, rel=0.1)
-    assert np.all(result.fit.held_out_rmse_after < 1.5 * NOISE)
+    assert told["friction_level"] == pytest.approx(4.0, rel=0.02)
+    assert told["breakaway_distance"] == pytest.approx(0.03, rel=0.05)
 
 
 PLANAR = """<mujoco><compiler angle="radian"/><worldbody><body>

@@ -101,13 +101,24 @@ def unresolved(traces: Sequence[Trace], torque: Torque) -> Float[np.ndarray, "ro
 def at_rest(
     traces: Sequence[Trace], effect: AbstractEffect, torque: Torque
 ) -> Float[np.ndarray, "rows dof"] | None:
-    """Square of what a law may be off for as long as a joint rests [N² m²]: dry friction, by all of it."""
+    """Square of what a law may be off for as long as a joint rests [N² m²]: dry friction, by all of it; and until
+    it has forgotten how it began, as nobody has recorded where its joint came from."""
     if not (effect.dry and effect.one_joint):
         return None
     j, rests = effect.joints[0], resting(traces)
+    share = rests[:, j]
+    if effect.forgets is not None:
+        share = np.maximum(share, np.concatenate([_remembered(t, j, float(effect.forgets)) for t in traces]))
     off = np.zeros_like(rests)
-    off[:, j] = np.square(_level(np.concatenate(torque)[:, j]) * rests[:, j])
+    off[:, j] = np.square(_level(np.concatenate(torque)[:, j]) * share)
     return off
+
+
+def _remembered(trace: Trace, joint: int, distance: float) -> Float[np.ndarray, " _time"]:
+    """Share of its beginning that is left of a law which forgets it over a distance [rad]."""
+    travelled = np.cumsum(np.abs(trace.channels.qd[:, joint])) * trace.dt
+    left = np.exp(-travelled[trace.keep] / distance)
+    return np.where(left > SEEN, left, 0.0)
 
 
 def known_at_rest(traces: Sequence[Trace]) -> Float[np.ndarray, "rows dof"]:

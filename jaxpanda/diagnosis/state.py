@@ -22,8 +22,8 @@ class State:
     design: Design
     joints: int
     """How many tell of themselves."""
-    counts: Float[np.ndarray, " dof"]
-    """How many samples of a joint do, by `Problem.counts`."""
+    counts: Float[np.ndarray, " dof"] | None = None
+    """How many samples tell of a joint, by `Problem.counts`; None for all."""
 
     @functools.cached_property
     def shares(self) -> Float[np.ndarray, "terms dof"]:
@@ -43,7 +43,11 @@ class State:
         counted = 0.0
         for j, r in enumerate(self.design.residual):
             here = r != 0
-            counted += 0.5 * float(r @ r) + self.counts[j] * float(np.log(self.noise.sigma[j]))
+            least = self.noise.sigma[j] if self.noise.least is None else self.noise.least[j]
+            count = np.count_nonzero(here)
+            told = count if self.counts is None else self.counts[j]
+            counted += 0.5 * float(r @ r) + count * float(np.log(least))
+            counted += told * float(np.log(self.noise.sigma[j] / least))
             counted += self.noise.widened(j, here)
         return self.design.log_evidence - counted + paid(self.terms, self.joints)
 

@@ -363,6 +363,11 @@ class AbstractEffect(eqx.Module):
         return self.dry_width is not None
 
     @property
+    def forgets(self) -> Array | float | None:
+        """Distance of its joint over which it forgets how it began [rad]; None where it has no such memory."""
+        return None
+
+    @property
     def feels(self) -> Literal["motion", "load", "acceleration"]:
         """What its torque follows besides position, velocity and time. A simulator takes the load of the step
         before, but solves for the acceleration: torque in its proportion is inertia, and bears no lag."""

@@ -122,6 +122,10 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         level = {"only": c[0], "extra": 0.0 * c[0], "whole": c[0] + c[-1]}[self._extent]
         return {"frictionloss": {int(self.joint): level}}
 
+    @property
+    def forgets(self) -> Array | float:
+        return self.breakaway_distance
+
     def start(self, s: Channels) -> Float[Array, " states"]:
         return turned(s.qd[self.joint])[None]
 

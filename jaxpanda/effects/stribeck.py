@@ -170,6 +170,10 @@ class StribeckBristles(AbstractMemoryEffect):
             + ", dz = (sign(dq) - z) * |dq| * dt / breakaway_distance"
         )
 
+    @property
+    def forgets(self) -> Array | float:
+        return self.breakaway_distance
+
     def start(self, s: Channels) -> Float[Array, " states"]:
         return turned(s.qd[self.joint])[None]
 
