@@ -97,6 +97,8 @@ class Trace:
     """Whether its torque shows faster motion than the noise of q lets through."""
     unsure: Float[np.ndarray, "time dof"] | None = None
     """1 where the sign of a joint's velocity cannot be told, else 0: friction at rest may carry any load."""
+    moving: Float[np.ndarray, "time dof"] | None = None
+    """`trust`, were known friction known at rest too; None for `trust`."""
     stuck: tuple[tuple[int, float, float], ...] = ()
     """Joint, start and stop [s] of stretches in which measured torque repeats itself although it must change."""
     friction_shown: Float[Array | np.ndarray, "2 dof"] | None = None
@@ -265,13 +267,16 @@ def prepare(recording: Recording, arm: Arm, *, coarse: float = WORK_RATE) -> Tra
     motion = trace.motion
     unsure = np.asarray(arm.frictionloss) * doubtful
     cut_off = _cut_off(position, qdd, cutoff_q, rate)[keep]
-    unsure = np.hypot(unsure, (np.abs(motion.mass) @ cut_off[:, :, None])[:, :, 0])
-    trust = 1 / np.sqrt(1 + (unsure / np.maximum(noise, 1e-12)) ** 2)
+    too_sharp = (np.abs(motion.mass) @ cut_off[:, :, None])[:, :, 0]
+    trust, moving = (
+        1 / np.sqrt(1 + (off / np.maximum(noise, 1e-12)) ** 2)
+        for off in (np.hypot(unsure, too_sharp), too_sharp)
+    )
     trust[:, np.ptp(motion.q, axis=0) < _HELD] = 0.0
     stuck = () if recording.tau is None else _stuck(recording.time, recording.tau, motion, noise)
     for joint, start, stop in stuck:
         trust[(motion.time > start - _NEAR) & (motion.time < stop + _NEAR), joint] = 0.0
-    return dataclasses.replace(trace, trust=trust, stuck=stuck)
+    return dataclasses.replace(trace, trust=trust, moving=moving, stuck=stuck)
 
 
 def _on_grids(

@@ -167,14 +167,13 @@ class Saturation:
             holds: that of a load which friction may hold: nothing is borne out there.
 
         Of white noise of variance $\sigma^2$ a model with orthonormal columns U takes
-        $\sigma^2 \sum_t U_{t-k} \cdot U_{t-l}$ of the moment of lags k and l: most where it is slow. Samples that
-        all weigh little, as of a joint that hardly ever moves, have no less noise: weights are such that those
-        that tell, $(\sum w^2)^2 / \sum w^4$, have it in full.
+        $\sigma^2 \sum_t U_{t-k} \cdot U_{t-l}$ of the moment of lags k and l: most where it is slow. Where a
+        joint may rest samples weigh little, and have no less noise (`scatter`); of one that creeps all do.
         """
         r, bases = self.left(joint, extra)
         basis = self._basis(joint)
         squares = self._weight(joint) ** 2
-        unit = basis.count / max(float(np.sum(squares)), 1e-300)
+        unit = basis.count / max(self.scatter[joint] * float(np.sum(squares)), 1e-300)
         r = r * np.sqrt(unit)
         taken = sum((self.moments(V) for V in bases[1:]), basis.taken)
         count, used = basis.count, sum(U.shape[1] for U in bases)
@@ -183,7 +182,7 @@ class Saturation:
         sigma, std = np.maximum(noise, self._resolved[joint]).tolist()
         b = np.concatenate([[1.0], -a])
         left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)]) / sigma
-        counts = unit * squares * (left != 0) * (holds == 0)
+        counts = np.minimum(unit * squares, 1.0) * (left != 0) * (holds == 0)
         share, scale = borne_out(left, off / std**2, counts)
         left /= scale * np.sqrt(1 + share * off / std**2)
         free = rests * (1 - sum(np.sum(U**2, 1) for U in bases))
@@ -257,8 +256,18 @@ class Saturation:
 
     def _count(self, joint: int) -> float:
         r"""How many samples tell of a joint: $(\sum w^2)^2 / \sum w^4$, their number where all weigh alike."""
-        squares = self._weight(joint) ** 2
-        return float(np.sum(squares) ** 2 / max(np.sum(squares**2), 1e-300))
+        return _telling(self._weight(joint))
+
+    @functools.cached_property
+    def scatter(self) -> Float[np.ndarray, " dof"]:
+        r"""Mean square of each joint's weighted noise, over $w^2$ and the noise's.
+
+        A sample of sharp motion has more noise than others, and weighs less for it: of all such ones the weighted
+        noise adds up to that of $(\sum w^2)^2 / \sum w^4$ others. A sample at which friction may hold any load
+        weighs less too, and has no more.
+        """
+        weights = [t.weight[:, None] * (t.trust if t.moving is None else t.moving) for t in self.traces]
+        return np.array([_telling(w) / max(float(np.sum(w**2)), 1e-300) for w in np.concatenate(weights).T])
 
     @functools.cached_property
     def ripples(self) -> list[list[Float[np.ndarray, "_time _n"]]]:
@@ -283,6 +292,12 @@ def _beside(basis: _Basis, E: Float[np.ndarray, "_rows _n"]) -> tuple[Float[np.n
         E = E - U @ (U.T @ E)
     V, s, _ = np.linalg.svd(E, full_matrices=False)
     return V[:, s > _RESOLVED * largest], largest
+
+
+def _telling(weight: Float[np.ndarray, " rows"]) -> float:
+    r"""$(\sum w^2)^2 / \sum w^4$."""
+    squares = weight**2
+    return float(np.sum(squares) ** 2 / max(np.sum(squares**2), 1e-300))
 
 
 def borne_out(

@@ -249,10 +249,9 @@ class Problem:
     def counts(self, noise: Noise, r: int, joint: int) -> Float[np.ndarray, " _time"]:
         """Mean square of weighted innovations that are noise, of the samples of a recording in a joint: little
         where it may rest, held at any load by friction, as samples scatter no more there for what they weigh."""
-        rows, own = self.rows[r], self.traces[r].weights[:, joint]
+        rows, out = self.rows[r], self.saturation.scatter[joint] * self.traces[r].weights[:, joint] ** 2
         if noise.at_rest is not None:
-            own = own * np.sqrt(1 - noise.at_rest[rows, joint] * noise.trusted(rows, joint) ** 2)
-        out = own**2
+            out *= 1 - noise.at_rest[rows, joint] * noise.trusted(rows, joint) ** 2
         out[: noise.a.shape[1]] = 0.0
         return out
 
