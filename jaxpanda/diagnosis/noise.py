@@ -174,15 +174,14 @@ class Saturation:
         basis = self._basis(joint)
         squares = self._weight(joint) ** 2
         unit = basis.count / max(self.scatter[joint] * float(np.sum(squares)), 1e-300)
-        r = r * np.sqrt(unit)
         taken = sum((self.moments(V) for V in bases[1:]), basis.taken)
         count, used = basis.count, sum(U.shape[1] for U in bases)
-        variance = float(r @ r) / max(count - used, LEAST_FREE * count)
-        a, *noise = autoregression(self.moments(r[:, None]) + variance * taken, count)
+        variance = unit * float(r @ r) / max(count - used, LEAST_FREE * count)
+        a, *noise = autoregression(unit * self.moments(r[:, None]) + variance * taken, count)
         sigma, std = np.maximum(noise, self._resolved[joint]).tolist()
         b = np.concatenate([[1.0], -a])
         left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)]) / sigma
-        counts = np.minimum(unit * squares, 1.0) * (left != 0) * (holds == 0)
+        counts = squares * (left != 0) * (holds == 0)
         share, scale = borne_out(left, off / std**2, counts)
         left /= scale * np.sqrt(1 + share * off / std**2)
         free = rests * (1 - sum(np.sum(U**2, 1) for U in bases))
