@@ -363,11 +363,6 @@ class AbstractEffect(eqx.Module):
         return self.dry_width is not None
 
     @property
-    def replaces_known(self) -> bool:
-        """Whether it acts in the place of the dry friction that the model holds."""
-        return False
-
-    @property
     def forgets(self) -> Array | float | None:
         """Distance of its joint over which it forgets how it began [rad]; None where it has no such memory."""
         return None

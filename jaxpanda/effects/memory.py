@@ -123,10 +123,6 @@ class PreslidingHysteresis(AbstractMemoryEffect):
         return {"frictionloss": {int(self.joint): level}}
 
     @property
-    def replaces_known(self) -> bool:
-        return self._extent == "extra"
-
-    @property
     def forgets(self) -> Array | float:
         return self.breakaway_distance
 

@@ -53,11 +53,8 @@ def as_recorded(whole: Sequence[Trajectory], corrected: Corrected, judged: Seque
 def _turns(
     moved: Sequence[Trajectory], corrected: Corrected, judged: Sequence[bool]
 ) -> tuple[Turn | None, ...]:
-    """How the friction of each joint turned; where that was not judged, as in most others that rub. As MuJoCo has
-    it where a law acts in its place."""
+    """How the friction of each joint turned; where that was not judged, as in most others that rub."""
     rubs = np.asarray(corrected.arm.frictionloss + corrected.frictionloss_change) != 0
-    replaced = [j for effect in corrected.effects if effect.replaces_known for j in effect.joints]
-    rubs[replaced] = False
     if not rubs.any():
         return ()
     ways = (None, *TURNS)
@@ -73,7 +70,6 @@ def _turns(
     nearest = np.where(np.isfinite(plain).any(0), plain.argmin(0), nearest)
     others = nearest[rubs & judged]
     nearest[~np.asarray(judged)] = np.argmax(np.bincount(others)) if len(others) else 0
-    nearest[replaced] = 0
     return tuple(ways[k] for k in nearest) if any(nearest) else ()
 
 
