@@ -249,7 +249,9 @@ class Problem:
     def counts(self, noise: Noise, r: int, joint: int) -> Float[np.ndarray, " _time"]:
         """Mean square of weighted innovations that are noise, of the samples of a recording in a joint: little
         where it may rest, held at any load by friction, as samples scatter no more there for what they weigh."""
-        rows, out = self.rows[r], self.saturation.scatter[joint] * self.traces[r].weights[:, joint] ** 2
+        rows, trace = self.rows[r], self.traces[r]
+        moving = trace.trust if trace.moving is None else trace.moving
+        out = trace.weight * (trace.trust[:, joint] / np.maximum(moving[:, joint], 1e-9)) ** 2
         if noise.at_rest is not None:
             out *= 1 - noise.at_rest[rows, joint] * noise.trusted(rows, joint) ** 2
         out[: noise.a.shape[1]] = 0.0
