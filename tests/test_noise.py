@@ -150,7 +150,7 @@ def test_rests_do_not_dilute_what_a_model_leaves_while_its_joint_moves(seed, lev
 def test_what_is_beyond_noise_is_told_by_the_samples_that_tell():
     weight = np.where(np.arange(4000) < 2500, 0.02, 1.0)
     left = 1.5 * weight * np.random.default_rng(0).normal(size=4000)
-    assert beyond([left], [weight**2], 0.02).scale == pytest.approx(1.5, rel=0.1)
+    assert beyond([left], float(np.sum(weight**2)), 0.02).scale == pytest.approx(1.5, rel=0.1)
 
 
 @pytest.mark.parametrize("shape", slow_errors(0.02))
@@ -173,7 +173,7 @@ def test_the_likeliest_slow_error_is_that_of_the_least_innovations(count):
     squares = [np.sum(levelled(y, slow)[0] ** 2) for slow in slow_errors(0.02)]
     np.testing.assert_allclose(_levelled_squares(y, 0.02), squares, rtol=1e-9)
     assert not slow_errors(1.5)  # at samples so far apart none is told
-    assert beyond([2.0 * y], [np.ones(count)], 1.5).slow == (0.0, 0.0)
+    assert beyond([2.0 * y], float(count), 1.5).slow == (0.0, 0.0)
 
 
 def test_a_slow_error_of_the_model_is_seen_where_there_is_one():

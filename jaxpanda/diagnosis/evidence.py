@@ -171,6 +171,12 @@ class Noise:
         """Whether there is an error slower than the noise in a joint."""
         return self.slow is not None and bool(self.slow[joint, 0] != self.slow[joint, 1])
 
+    def is_widened(self, joint: int) -> bool:
+        """Whether a joint's noise is more than where nothing is left unexplained."""
+        return self.has_slow(joint) or (
+            self.least is not None and bool(self.sigma[joint] != self.least[joint])
+        )
+
     def response(self, joint: int, angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """What `whiten` makes of the power of a wave that turns by so many radians a step."""
         back = np.exp(-1j * angle)

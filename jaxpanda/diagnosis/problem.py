@@ -246,16 +246,18 @@ class Problem:
         """What the samples of a recording weigh in a joint."""
         return self.traces[r].weights[:, joint] * noise.trusted(self.rows[r], joint)
 
-    def counts(self, noise: Noise, r: int, joint: int) -> Float[np.ndarray, " _time"]:
-        """Mean square of weighted innovations that are noise, of the samples of a recording in a joint: little
-        where it may rest, held at any load by friction, as samples scatter no more there for what they weigh."""
-        rows, trace = self.rows[r], self.traces[r]
-        moving = trace.trust if trace.moving is None else trace.moving
-        out = trace.weight * (trace.trust[:, joint] / np.maximum(moving[:, joint], 1e-9)) ** 2
-        if noise.at_rest is not None:
-            out *= 1 - noise.at_rest[rows, joint] * noise.trusted(rows, joint) ** 2
-        out[: noise.a.shape[1]] = 0.0
-        return out
+    def counts(self, noise: Noise, joint: int) -> float:
+        """How many samples tell of a joint: the square of weighted innovations that are noise, in sum. One counts
+        little where the joint may rest, held at any load by friction: it scatters no more there for what it
+        weighs."""
+        total = 0.0
+        for rows, trace in zip(self.rows, self.traces, strict=True):
+            moving = trace.trust if trace.moving is None else trace.moving
+            each = trace.weight * (trace.trust[:, joint] / np.maximum(moving[:, joint], 1e-9)) ** 2
+            if noise.at_rest is not None:
+                each = each * (1 - noise.at_rest[rows, joint] * noise.trusted(rows, joint) ** 2)
+            total += float(np.sum(each[noise.a.shape[1] :]))
+        return total
 
     @functools.cached_property
     def rows(self) -> list[slice]:
@@ -309,8 +311,7 @@ class Problem:
         trust = None if noise.trust is None else noise.trust[:, joint].tobytes()
         slow = noise.slow[joint].tobytes() if noise.has_slow(joint) else None  # pyright: ignore
         stamp = noise.a[joint].tobytes(), float(noise.sigma[joint]), trust, slow
-        widened = slow is not None or (noise.least is not None and noise.sigma[joint] != noise.least[joint])
-        key = joint, bool(widened)
+        key = joint, noise.is_widened(joint)
         here = self._joints.get(key)
         if here is None or here.stamp != stamp:
             residual = self.whitened([r[:, joint] for r in self.residual], noise, joint)

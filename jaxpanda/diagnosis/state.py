@@ -79,7 +79,7 @@ def with_terms(problem: Problem, terms: Sequence[Term]) -> State:
     # what a fit leaves depends on the noise it was made in: that of the last model, and none that is unexplained
     starts = (*problem.beyond_noise, (Beyond(),) * problem.dof)
     x = [widened(start).design.x for start in starts]
-    counts = [counted(problem, noise, j) for j in range(problem.dof)]
+    counts = [problem.counts(noise, j) for j in range(problem.dof)]
     each = [left_over(problem, noise, terms, c) for c in x]
     left = [[beyond(y, n, dt) for y, n in zip(of_joints, counts, strict=True)] for of_joints in each]
     least = tuple(min(of_joint, key=lambda b: b.left) for of_joint in zip(*left, strict=True))
@@ -101,11 +101,6 @@ def left_over(
         left = enumerate(misfit(problem, terms, x, j))
         out.append([noise.weighted(y, j, problem.weights(noise, r, j), problem.rows[r]) for r, y in left])
     return out
-
-
-def counted(problem: Problem, noise: Noise, joint: int) -> list[Float[np.ndarray, " _time"]]:
-    """Of each recording, `Problem.counts`."""
-    return [problem.counts(noise, r, joint) for r in range(len(problem.traces))]
 
 
 def misfit(
@@ -136,16 +131,14 @@ class Beyond:
     """Twice the nats that a sample of them costs beside that."""
 
 
-def beyond(
-    left: Sequence[Float[np.ndarray, " _time"]], counts: Sequence[Float[np.ndarray, " _time"]], dt: float
-) -> Beyond:
+def beyond(left: Sequence[Float[np.ndarray, " _time"]], count: float, dt: float) -> Beyond:
     """The slow error, if what is left is beyond the noise, with which a joint's innovations are smallest; its two
     numbers must be worth it (Schwarz 1978).
 
-    `counts`: mean square of what is left where it is noise.
+    `count`: how many samples tell, by `Problem.counts`.
     """
-    best, shape = float(np.log(max(_mean_square(left, counts), 1e-300))), (0.0, 0.0)
-    count = max(float(sum(map(np.sum, counts))), 2.0)
+    best, shape = float(np.log(max(_mean_square(left, count), 1e-300))), (0.0, 0.0)
+    count = max(count, 2.0)
     if best > 0 and (tried := slow_errors(dt)):
         squares = sum(_levelled_squares(part[rows], dt) for part in left for rows in stretches(part != 0))
         found = np.log(squares / count) + 2 * np.log(count) / count
@@ -199,7 +192,7 @@ def _responses(dt: float, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def in_noise(problem: Problem, terms: Sequence[Term], noise: Noise) -> State:
     """The model with these terms, in some noise."""
-    counts = np.array([sum(map(np.sum, counted(problem, noise, j))) for j in range(problem.dof)])
+    counts = np.array([problem.counts(noise, j) for j in range(problem.dof)])
     return State(tuple(terms), noise, problem.design(terms, noise), problem.telling, counts)
 
 
@@ -240,32 +233,27 @@ def evidence(problem: Problem, terms: Sequence[Term], design: Design, noise: Noi
     Where a joint has errors beyond the saturated model's noise their size is not known, and falls with what is
     explained: there $-\tfrac12 \sum e^2$ gives way to $-\tfrac n2 \log s^2$ in the noise that is left.
     """
-    uneven = (
-        []
-        if noise.least is None
-        else [j for j in range(problem.dof) if noise.has_slow(j) or noise.sigma[j] > noise.least[j]]
-    )
-    if not uneven:
+    uneven = [j for j in range(problem.dof) if noise.is_widened(j)]
+    if noise.least is None or not uneven:
         return design.log_evidence
     plain, dt = dataclasses.replace(noise, sigma=noise.least, slow=None), problem.traces[0].motion.dt
-    counts = {j: counted(problem, noise, j) for j in uneven}
+    counts = {j: problem.counts(noise, j) for j in uneven}
 
     def told(fitted: Design, wide: Noise) -> float:
         out = fitted.log_evidence
         for j, parts in zip(uneven, left_over(problem, plain, terms, fitted.x, uneven), strict=True):
             as_is = np.concatenate([wide.level(part, j, part != 0) for part in parts])
             as_is *= plain.sigma[j] / wide.sigma[j]
-            r, count = fitted.residual[j], float(sum(map(np.sum, counts[j])))
-            out += 0.5 * (float(as_is @ as_is - r @ r) - count * beyond(parts, counts[j], dt).left)
+            r = fitted.residual[j]
+            out += 0.5 * (float(as_is @ as_is - r @ r) - counts[j] * beyond(parts, counts[j], dt).left)
         return out
 
     # a fit among slow errors does not see what is slow
     best = max(told(design, noise), told(problem.design(terms, plain), plain))
-    wider = {j: float(np.log(noise.sigma[j] / plain.sigma[j])) for j in uneven}
-    return best + sum(
-        0.5 * float(np.sum(design.residual[j] ** 2)) + float(sum(map(np.sum, counts[j]))) * wider[j]
-        for j in uneven
-    )
+    for j in uneven:
+        r = design.residual[j]
+        best += 0.5 * float(r @ r) + counts[j] * float(np.log(noise.sigma[j] / plain.sigma[j]))
+    return best
 
 
 def likelier(a: tuple[Problem, State], b: tuple[Problem, State]) -> float:
@@ -332,14 +320,12 @@ def mean_squares(
 ) -> Float[np.ndarray, " dof"]:
     """Of what a model leaves of each joint, whitened by a saturated model's noise: 1 where it is noise."""
     left = left_over(problem, noise, terms, x)
-    return np.array([_mean_square(y, counted(problem, noise, j)) for j, y in enumerate(left)])
+    return np.array([_mean_square(y, problem.counts(noise, j)) for j, y in enumerate(left)])
 
 
-def _mean_square(
-    left: Sequence[Float[np.ndarray, " _time"]], counts: Sequence[Float[np.ndarray, " _time"]]
-) -> float:
-    """Of what is left of a joint in each recording, whitened, over that of noise."""
-    return float(sum(y @ y for y in left)) / max(float(sum(map(np.sum, counts))), 1.0)
+def _mean_square(left: Sequence[Float[np.ndarray, " _time"]], count: float) -> float:
+    """Of what is left of a joint in each recording, whitened, over that of noise of so many samples."""
+    return float(sum(y @ y for y in left)) / max(count, 1.0)
 
 
 _LASTING, _LARGER = (0.5, 2.0), 2.0
