@@ -115,6 +115,19 @@ class Trace:
         return self.weight[:, None] * self.trust
 
     @property
+    def scatter(self) -> Float[np.ndarray, "time dof"]:
+        """Mean square of each sample's weighted noise, over that of others: 1, but less where friction at rest
+        may hold any load. A sample weighs less there, and has no more noise."""
+        if self.moving is None:
+            return self.weights**2
+        return self.weight[:, None] * (self.trust / self.moving) ** 2
+
+    @property
+    def too_sharp(self) -> Float[np.ndarray, "time dof"]:
+        """Variance, over that of the noise, of what torque may be off by where the motion is too sharp."""
+        return np.zeros_like(self.trust) if self.moving is None else 1 / self.moving**2 - 1
+
+    @property
     def residual(self) -> Float[np.ndarray, "time dof"]:
         """Measured less nominal torque [N m]."""
         assert self.tau is not None
@@ -157,6 +170,15 @@ class Trace:
         channels = dataclasses.replace(self.channels, torque=self.channels.torque + more)
         motion = self.motion.showing(self.down(more))
         return dataclasses.replace(self, channels=channels, motion=motion, friction_shown=friction)
+
+    def as_sharp_as(self, share: Float[np.ndarray, " dof"]) -> "Trace":
+        """The same, where recordings show in each joint that share of the variance `too_sharp`."""
+        if self.moving is None:
+            return self
+        less = (1 - share) * self.too_sharp
+        trust = 1 / np.sqrt(1 / np.maximum(self.trust, 1e-30) ** 2 - less)
+        moving = 1 / np.sqrt(1 / self.moving**2 - less)
+        return dataclasses.replace(self, trust=np.where(self.trust > 0, trust, 0.0), moving=moving)
 
     def down(self, fine: Float[np.ndarray, "fine ..."]) -> Float[np.ndarray, "time ..."]:
         """From the fine grid to the coarse one, filtered like the torque."""

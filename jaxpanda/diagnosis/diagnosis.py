@@ -33,6 +33,7 @@ from .finding import VERDICTS, Finding, Fit
 from .friction_shown import friction_shown
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
+from .noise import as_sharp_as_shown
 from .posterior import posterior_of
 from .premises import Premises, settled
 from .problem import FOLDS, Problem, Term
@@ -179,7 +180,7 @@ def sought(
     progress("looking for effects that make the recordings likelier; that takes most of the time")
     log = _Log(progress)
     shown = friction_shown([t for t, on in zip(traces, active, strict=True) if on])
-    traces = [t.showing(shown) for t in traces]
+    traces = as_sharp_as_shown([t.showing(shown) for t in traces])
     premises, searched = settled(tuple(traces), tuple(active), knowledge, log, catalogue=catalogue)
     problem = premises.problem
     progress("refining the numbers, and weighing what else it could be")

@@ -34,6 +34,8 @@ beside less, as of a simulation without noise, a prior could not be told. And of
 from which one counts."""
 _SHARES = (0.0, 0.001, 0.01, 0.1, 1.0)
 """Of the variance of what laws may be off from sample to sample, those that are told apart."""
+_SHARP = tuple(np.geomspace(1e-3, 1.0, 10).tolist())
+"""Of the variance of what torque may be off by in sharp motion, those that are told apart."""
 
 
 def hats(x: Float[np.ndarray, " _time"], count: int) -> Float[np.ndarray, "_time _count"]:
@@ -168,12 +170,12 @@ class Saturation:
 
         Of white noise of variance $\sigma^2$ a model with orthonormal columns U takes
         $\sigma^2 \sum_t U_{t-k} \cdot U_{t-l}$ of the moment of lags k and l: most where it is slow. Where a
-        joint may rest samples weigh little, and have no less noise (`scatter`); of one that creeps all do.
+        joint may rest samples weigh little, and have no less noise (`Trace.scatter`); of one that creeps all do.
         """
         r, bases = self.left(joint, extra)
         basis = self._basis(joint)
-        squares = self._weight(joint) ** 2
-        unit = basis.count / max(self.scatter[joint] * float(np.sum(squares)), 1e-300)
+        told = self._told(joint)
+        unit = basis.count / max(float(np.sum(told)), 1e-300)
         taken = sum((self.moments(V) for V in bases[1:]), basis.taken)
         count, used = basis.count, sum(U.shape[1] for U in bases)
         variance = unit * float(r @ r) / max(count - used, LEAST_FREE * count)
@@ -181,7 +183,7 @@ class Saturation:
         sigma, std = np.maximum(noise, self._resolved[joint]).tolist()
         b = np.concatenate([[1.0], -a])
         left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)]) / sigma
-        counts = squares * (left != 0) * (holds == 0)
+        counts = told * (left != 0) * (holds == 0)
         share, scale = borne_out(left, off / std**2, counts)
         left /= scale * np.sqrt(1 + share * off / std**2)
         free = rests * (1 - sum(np.sum(U**2, 1) for U in bases))
@@ -253,20 +255,28 @@ class Saturation:
     def _weight(self, joint: int) -> Float[np.ndarray, " _rows"]:
         return np.concatenate([t.weights[:, joint] for t in self.traces])
 
+    def _told(self, joint: int) -> Float[np.ndarray, " _rows"]:
+        """`Trace.scatter`."""
+        return np.concatenate([t.scatter[:, joint] for t in self.traces])
+
     def _count(self, joint: int) -> float:
-        r"""How many samples tell of a joint: $(\sum w^2)^2 / \sum w^4$, their number where all weigh alike."""
-        return _telling(self._weight(joint))
+        r"""How many samples tell of a joint: $(\sum s)^2 / \sum s^2$ with s their `Trace.scatter`, their number
+        where all scatter alike."""
+        told = self._told(joint)
+        return float(np.sum(told) ** 2 / max(np.sum(told**2), 1e-300))
 
-    @functools.cached_property
-    def scatter(self) -> Float[np.ndarray, " dof"]:
-        r"""Mean square of each joint's weighted noise, over $w^2$ and the noise's.
-
-        A sample of sharp motion has more noise than others, and weighs less for it: of all such ones the weighted
-        noise adds up to that of $(\sum w^2)^2 / \sum w^4$ others. A sample at which friction may hold any load
-        weighs less too, and has no more.
-        """
-        weights = [t.weight[:, None] * (t.trust if t.moving is None else t.moving) for t in self.traces]
-        return np.array([_telling(w) / max(float(np.sum(w**2)), 1e-300) for w in np.concatenate(weights).T])
+    def sharpness(self, joint: int) -> float:
+        """The largest share of `Trace.too_sharp` that a joint's innovations do not deny: what a filter takes away
+        is looked for around a sample, and at the sample itself less is missing, mostly."""
+        off = np.concatenate([t.too_sharp[:, joint] for t in self.traces])
+        if not np.any(off) or not self.tells(joint):
+            return 1.0
+        r, _ = self.left(joint)
+        a, *_ = autoregression(self.moments(r[:, None]), self.samples(joint))
+        b = np.concatenate([[1.0], -a])
+        left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)])
+        nats, _ = likelihoods(left * np.sqrt(1 + off), off, self._told(joint) * (left != 0), _SHARP)
+        return float(_SHARP[np.flatnonzero(nats > nats.max() - 0.5 * np.log(self.samples(joint)))[-1]])
 
     @functools.cached_property
     def ripples(self) -> list[list[Float[np.ndarray, "_time _n"]]]:
@@ -284,6 +294,13 @@ class Saturation:
         return parallel(one, range(self.traces[0].motion.dof))
 
 
+def as_sharp_as_shown(traces: Sequence[Trace]) -> list[Trace]:
+    """Recordings that trust samples of sharp motion as far as their innovations bear out."""
+    saturation = Saturation(traces)
+    share = np.array([saturation.sharpness(joint) for joint in range(traces[0].motion.dof)])
+    return [t.as_sharp_as(share) for t in traces]
+
+
 def _beside(basis: _Basis, E: Float[np.ndarray, "_rows _n"]) -> tuple[Float[np.ndarray, "_rows _m"], float]:
     """An orthonormal basis of what further columns add to one, and the largest singular value of either."""
     U, largest = basis.U, max(basis.largest, float(np.linalg.norm(E, 2)))
@@ -291,12 +308,6 @@ def _beside(basis: _Basis, E: Float[np.ndarray, "_rows _n"]) -> tuple[Float[np.n
         E = E - U @ (U.T @ E)
     V, s, _ = np.linalg.svd(E, full_matrices=False)
     return V[:, s > _RESOLVED * largest], largest
-
-
-def _telling(weight: Float[np.ndarray, " rows"]) -> float:
-    r"""$(\sum w^2)^2 / \sum w^4$."""
-    squares = weight**2
-    return float(np.sum(squares) ** 2 / max(np.sum(squares**2), 1e-300))
 
 
 def borne_out(
@@ -316,12 +327,23 @@ def borne_out(
     count = float(np.sum(counts))
     if count < 1:
         return _SHARES[0], 1.0
-    squares = np.where(counts > 0, left, 0.0) ** 2
-    spread = [1 + share * off for share in _SHARES]
-    variance = np.maximum([np.sum(squares / x) for x in spread], 1e-300)
-    nats = -0.5 * (count * np.log(variance) + [counts @ np.log(x) for x in spread])
+    nats, variance = likelihoods(left, off, counts, _SHARES)
     least = int(np.argmax(nats > nats.max() - 0.5 * np.log(count)))
     return _SHARES[least], float(np.sqrt(variance[least] / variance[0]))
+
+
+def likelihoods(
+    left: Float[np.ndarray, " rows"],
+    off: Float[np.ndarray, " rows"],
+    counts: Float[np.ndarray, " rows"],
+    shares: Sequence[float],
+) -> tuple[Float[np.ndarray, " _share"], Float[np.ndarray, " _share"]]:
+    """Log likelihood of each share of an error, with the arguments of `borne_out`, and the sum of squares of the
+    innovations beside it."""
+    squares = np.where(counts > 0, left, 0.0) ** 2
+    spread = [1 + share * off for share in shares]
+    variance = np.maximum([np.sum(squares / x) for x in spread], 1e-300)
+    return -0.5 * (np.sum(counts) * np.log(variance) + [counts @ np.log(x) for x in spread]), variance
 
 
 def strongest_order(

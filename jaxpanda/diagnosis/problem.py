@@ -252,8 +252,7 @@ class Problem:
         weighs."""
         total = 0.0
         for rows, trace in zip(self.rows, self.traces, strict=True):
-            moving = trace.trust if trace.moving is None else trace.moving
-            each = trace.weight * (trace.trust[:, joint] / np.maximum(moving[:, joint], 1e-9)) ** 2
+            each = trace.scatter[:, joint]
             if noise.at_rest is not None:
                 each = each * (1 - noise.at_rest[rows, joint] * noise.trusted(rows, joint) ** 2)
             total += float(np.sum(each[noise.a.shape[1] :]))
