@@ -165,6 +165,13 @@ def _wrapped(cells: list[list[str]]) -> str:
     return text(cells)
 
 
+def _sliding(cells: list[list[str]]) -> str:
+    """At 630 mm/s."""
+    for row in cells[1:]:
+        row[1] = repr(630 * float(row[0]))
+    return text(cells)
+
+
 def _reset(cells: list[list[str]]) -> str:
     for row in cells[50:]:
         row[2] = repr(float(row[2]) + 0.3)
@@ -202,6 +209,10 @@ BAD = {
     "a wrapped angle": (
         _wrapped,
         r"column q_1, row \d+ \(line \d+\): the angle jumps by a turn.*numpy.unwrap",
+    ),
+    "a slide in millimetres": (
+        _sliding,
+        r"column q_1, row \d+ \(line \d+\): the angle jumps by a turn.*millimetres.*q_1=q_1:mm",
     ),
     "an encoder that was reset": (
         _reset,

@@ -159,6 +159,8 @@ def _unwrapped(recording: Recording, row: Callable[[int], str]) -> None:
         cure = (_without_edge(recording, i) if jumps.sum() == 1 else "") or (
             ", where positions must be continuous: unwrap them, as numpy.unwrap(q, axis=0) does"
         )
+        if np.max(np.abs(recording.q[:, j])) > 4 * _TURN:
+            cure += f"; or, if the joint slides, by millimetres, say so, as --columns q_{j + 1}=q_{j + 1}:mm"
         raise InputError(
             f"{recording.name}: column q_{j + 1}, {row(i)}: the angle jumps by a turn ({before:.4g} rad, then "
             f"{after:.4g} rad; {int(jumps.sum())} such jumps in all){cure}"

@@ -9,7 +9,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..arms.arm import Arm
 from ..arms.mjcf import MjcfSource
@@ -89,7 +89,7 @@ def limits_of(arm: Arm, source: MjcfSource, given: Mapping[str, Sequence[float]]
     known = published()["panda"] if is_franka_panda(arm) else {}
     for name in ("velocity", "acceleration", "jerk"):
         values[name] = np.array(known.get(name, np.where(slides, SLIDING[name], TURNING[name])), float)
-        sources[name] = "published by Franka for the Panda" if known else "assumed; say better"
+        sources[name] = "published by Franka for the Panda" if known else _assumed(name, slides)
     values["torque"] = actuator_limits(source)
     sources["torque"] = f"of the actuators in {source.path.name}"
     if known:
@@ -107,6 +107,16 @@ def limits_of(arm: Arm, source: MjcfSource, given: Mapping[str, Sequence[float]]
         values[name] = np.broadcast_to(np.array(numbers, float), arm.dof).copy()
         sources[name] = "given"
     return Limits(lower, upper, **values, sources=sources)
+
+
+def _assumed(name: str, slides: Bool[np.ndarray, " dof"]) -> str:
+    """What is said of a limit that nobody gave, by its name in `Limits`."""
+    power = {"velocity": "", "acceleration": "²", "jerk": "³"}[name]
+    turning, sliding = f"{TURNING[name]:g} rad/s{power}", f"{SLIDING[name]:g} m/s{power}"
+    value = (
+        sliding if slides.all() else turning if not slides.any() else f"{turning}, {sliding} where it slides"
+    )
+    return f"assumed, {value}; --{name} takes your arm's"
 
 
 def is_franka_panda(arm: Arm) -> bool:
