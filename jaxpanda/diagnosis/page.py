@@ -632,16 +632,17 @@ def _shade(gain: float) -> float | None:
 def _left_out(found: Diagnosis, held: Collection[tuple[str, int]], names: Sequence[str]) -> list[Table]:
     """What would have explained something by itself and is not among the findings (`held`)."""
     heat, rows = found.heat_map, []
+    needed = {effect.name: -effect.prior for effect in found.problem.catalogue}
     for effect, alone, beside in zip(heat.effects, heat.alone, heat.beside, strict=True):
         for j, (gain, left) in enumerate(zip(alone, beside, strict=True)):
             if not gain >= _TRIED or (effect, j) in held:  # NaN: was not tried
                 continue
-            more = left >= _TRIED
-            why = (
-                "predicts better beside the findings too, and was not taken"
-                if more
-                else "the findings explain it"
-            )
+            if left < _TRIED or np.isnan(left):
+                why = "the findings explain it"
+            elif left < needed[effect]:
+                why = f"it gains less than the {needed[effect]:.0f} by which it is unlikely beforehand"
+            else:
+                why = "torque is predicted better with it too; no likelier model that was tried has it"
             cells = [_plain(effect), names[j], _gain(gain), "" if np.isnan(left) else _gain(left), why]
             rows.append((gain, cells))
     if not rows:
