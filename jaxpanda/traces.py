@@ -114,7 +114,7 @@ class Trace:
         """`weight` and `trust` together."""
         return self.weight[:, None] * self.trust
 
-    @property
+    @functools.cached_property
     def scatter(self) -> Float[np.ndarray, "time dof"]:
         """Mean square of each sample's weighted noise, over that of others: 1, but less where friction at rest
         may hold any load. A sample weighs less there, and has no more noise."""

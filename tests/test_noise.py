@@ -234,8 +234,7 @@ def test_white_noise_bears_out_nothing_that_laws_are_off(off):
 
 @pytest.mark.parametrize("share", [0.01, 0.1, 1.0])
 def test_samples_of_sharp_motion_are_trusted_as_far_as_they_are_right(share):
-    """Of real arms a hundredth to a half of what the filter may have taken away is missing. Taken for missing
-    whole, a quarter of a UR10e's samples did not count."""
+    """Taken for missing whole, what the filter may have taken away silenced samples of which little was."""
     trace, exact = prepare(still_right(12.0, 0), ARM), prepare(still_right(12.0, 0, 0.0), ARM)
     assert trace.tau is not None
     off = 80 * np.maximum(np.sin(np.linspace(0, 30, len(trace.tau))), 0)[:, None] ** 4 * np.ones(7)

@@ -181,8 +181,7 @@ class Saturation:
         variance = unit * float(r @ r) / max(count - used, LEAST_FREE * count)
         a, *noise = autoregression(unit * self.moments(r[:, None]) + variance * taken, count)
         sigma, std = np.maximum(noise, self._resolved[joint]).tolist()
-        b = np.concatenate([[1.0], -a])
-        left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)]) / sigma
+        left = self._innovations(r, a) / sigma
         counts = told * (left != 0) * (holds == 0)
         share, scale = borne_out(left, off / std**2, counts)
         left /= scale * np.sqrt(1 + share * off / std**2)
@@ -252,6 +251,13 @@ class Saturation:
         """The rows of each recording."""
         return np.split(x, np.cumsum([t.motion.samples for t in self.traces])[:-1])
 
+    def _innovations(
+        self, x: Float[np.ndarray, " _rows"], a: Float[np.ndarray, " _order"]
+    ) -> Float[np.ndarray, " _rows"]:
+        """What an autoregression does not foretell of each recording."""
+        b = np.concatenate([[1.0], -a])
+        return np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(x)])
+
     def _weight(self, joint: int) -> Float[np.ndarray, " _rows"]:
         return np.concatenate([t.weights[:, joint] for t in self.traces])
 
@@ -273,8 +279,7 @@ class Saturation:
             return 1.0
         r, _ = self.left(joint)
         a, *_ = autoregression(self.moments(r[:, None]), self.samples(joint))
-        b = np.concatenate([[1.0], -a])
-        left = np.concatenate([np.convolve(part, b)[: len(part)] for part in self._apart(r)])
+        left = self._innovations(r, a)
         nats, _ = likelihoods(left * np.sqrt(1 + off), off, self._told(joint) * (left != 0), _SHARP)
         return float(_SHARP[np.flatnonzero(nats > nats.max() - 0.5 * np.log(self.samples(joint)))[-1]])
 
