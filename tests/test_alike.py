@@ -5,12 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxpanda.diagnosis.alike import TEMPERATURE, one_more, shared
 from jaxpanda.effects.drive import Armature, JointSpring
 from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.effects.stribeck import StribeckFriction
+from jaxpanda.inference.alike import TEMPERATURE, one_more, shared
 
 DOF = 7
 

@@ -7,11 +7,11 @@ import pytest
 from scipy.optimize import least_squares, minimize
 
 from jaxpanda import Arm
-from jaxpanda.diagnosis.bodies import Body, Correction, at_bounds, body, likeliest
-from jaxpanda.diagnosis.evidence import Design, gram
-from jaxpanda.diagnosis.problem import Term
 from jaxpanda.effects.load import Payload, PayloadChange
 from jaxpanda.feasible.nearest import are_buildable
+from jaxpanda.inference.bodies import Body, Correction, at_bounds, body, likeliest
+from jaxpanda.inference.evidence import Design, gram
+from jaxpanda.inference.problem import Term
 
 DIRECTIONS = Payload.grid(Arm.panda())[-1].body
 

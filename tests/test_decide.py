@@ -14,22 +14,22 @@ from helpers import record, to_mujoco
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose, predict
-from jaxpanda.diagnosis.credible import changes, is_of_time
 from jaxpanda.diagnosis.decide import findings, foretold, worded
 from jaxpanda.diagnosis.diagnosis import Fit, verdict
-from jaxpanda.diagnosis.events import windows
 from jaxpanda.diagnosis.finding import Finding
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.proposals import grids
-from jaxpanda.diagnosis.search import climb, exchange, merge, names, posterior, search, stand_ins
-from jaxpanda.diagnosis.shapes import refine
-from jaxpanda.diagnosis.state import likelier, misfit, places, start, with_terms
 from jaxpanda.effects import Motion
 from jaxpanda.effects.drive import JointSpring
 from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueDrift, TorqueOffset
 from jaxpanda.effects.unknown import Unknown
+from jaxpanda.inference.state import likelier, misfit, places, start, with_terms
+from jaxpanda.search.credible import changes, is_of_time
+from jaxpanda.search.events import windows
+from jaxpanda.search.premises import pose
+from jaxpanda.search.proposals import grids
+from jaxpanda.search.shapes import refine
+from jaxpanda.search.steps import climb, exchange, merge, names, posterior, search, stand_ins
 from jaxpanda.traces import prepare
 
 
@@ -290,10 +290,10 @@ def test_what_a_merge_took_out_does_not_come_back_without_end(monkeypatch):
         assert len(grown) < 5
         return pair()
 
-    monkeypatch.setattr("jaxpanda.diagnosis.search.grow", grow)
-    monkeypatch.setattr("jaxpanda.diagnosis.search.choices", lambda *_: [(1e9, (one,))])
+    monkeypatch.setattr("jaxpanda.search.steps.grow", grow)
+    monkeypatch.setattr("jaxpanda.search.steps.choices", lambda *_: [(1e9, (one,))])
     fewer = lambda a, b: float(len(a[1].terms) - len(b[1].terms))
-    monkeypatch.setattr("jaxpanda.diagnosis.search.likelier", fewer)
+    monkeypatch.setattr("jaxpanda.search.steps.likelier", fewer)
     assert merge(problem, pair(), lambda _: None).terms == (one,)
 
 
@@ -390,9 +390,9 @@ def test_a_round_that_leads_back_to_the_same_terms_is_the_last(monkeypatch):
         rounds.append(state)
         return with_terms(problem, [problem.term(CoulombFriction(1, 0.01), np.array([0.5]))])
 
-    monkeypatch.setattr("jaxpanda.diagnosis.search.grow", grown)
+    monkeypatch.setattr("jaxpanda.search.steps.grow", grown)
     for step in ("exchange", "merge", "prune"):
-        monkeypatch.setattr(f"jaxpanda.diagnosis.search.{step}", lambda problem, state, *_: state)
+        monkeypatch.setattr(f"jaxpanda.search.steps.{step}", lambda problem, state, *_: state)
     climb(problem, start(problem), lambda _: None)
     assert len(rounds) == 2
 
@@ -402,9 +402,9 @@ def test_a_search_that_comes_to_the_laws_of_another_ends_there(monkeypatch):
     problem = posed(record(7))
     met = with_terms(problem, [problem.term(CoulombFriction(1, 0.01), np.array([0.5]))])
     other = with_terms(problem, [problem.term(CoulombFriction(1, 0.02), np.array([0.5]))])
-    monkeypatch.setattr("jaxpanda.diagnosis.search.grow", lambda *_: other)
-    monkeypatch.setattr("jaxpanda.diagnosis.search.prune", lambda problem, state, *_: state)
-    monkeypatch.setattr("jaxpanda.diagnosis.search.exchange", lambda *_: pytest.fail("searched on"))
+    monkeypatch.setattr("jaxpanda.search.steps.grow", lambda *_: other)
+    monkeypatch.setattr("jaxpanda.search.steps.prune", lambda problem, state, *_: state)
+    monkeypatch.setattr("jaxpanda.search.steps.exchange", lambda *_: pytest.fail("searched on"))
     assert climb(problem, start(problem), lambda _: None, met=names(met)) is other
 
 
@@ -417,7 +417,7 @@ def test_a_step_is_tried_again_with_free_forms_where_they_were_barred(monkeypatc
         tried.append(free)
         return [(1.0, (state.terms[i],))], barred and not free
 
-    monkeypatch.setattr("jaxpanda.diagnosis.search.instead", instead)
+    monkeypatch.setattr("jaxpanda.search.steps.instead", instead)
     for free in (False, False, True, True):
         assert exchange(problem, state, lambda _: None, free) is state
     assert tried == ([False, True] if barred else [False])

@@ -24,16 +24,8 @@ from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.arms.source import from_document
 from jaxpanda.corrected import Corrected
 from jaxpanda.diagnosis import diagnose, page, predict
-from jaxpanda.diagnosis.credible import is_event
 from jaxpanda.diagnosis.decide import titles, worded
-from jaxpanda.diagnosis.evidence import Design, gram, log_bayes
-from jaxpanda.diagnosis.knowledge import check, inertial_spread
-from jaxpanda.diagnosis.noise import autoregression, moments
 from jaxpanda.diagnosis.posterior import posterior_of
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.problem import Term
-from jaxpanda.diagnosis.search import crossed, exchange, instead, transferable
-from jaxpanda.diagnosis.state import torque, with_terms
 from jaxpanda.diagnosis.written import buildable, corrected_document, worsened
 from jaxpanda.effects import Motion
 from jaxpanda.effects.contact import ExternalContact
@@ -45,8 +37,16 @@ from jaxpanda.effects.sensing import TorqueCrosstalk, TorqueOffset
 from jaxpanda.effects.stribeck import StribeckFriction
 from jaxpanda.feasible.nearest import are_buildable
 from jaxpanda.files import write_json
+from jaxpanda.inference.evidence import Design, gram, log_bayes
+from jaxpanda.inference.knowledge import check, inertial_spread
+from jaxpanda.inference.noise import autoregression, moments
+from jaxpanda.inference.problem import Term
+from jaxpanda.inference.state import torque, with_terms
 from jaxpanda.report import to_html
 from jaxpanda.rollout import compare
+from jaxpanda.search.credible import is_event
+from jaxpanda.search.premises import pose
+from jaxpanda.search.steps import crossed, exchange, instead, transferable
 from jaxpanda.traces import prepare, trajectory
 
 

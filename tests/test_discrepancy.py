@@ -8,23 +8,6 @@ import pytest
 from helpers import NOISE, record
 
 from jaxpanda import Arm
-from jaxpanda.diagnosis.discrepancy import at_rest, of_known, of_law, unresolved
-from jaxpanda.diagnosis.events import swept
-from jaxpanda.diagnosis.evidence import Design, Noise
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.proposals import grids
-from jaxpanda.diagnosis.search import exchange, posterior, prune, remade, search
-from jaxpanda.diagnosis.state import (
-    State,
-    evidence,
-    gains,
-    in_noise,
-    likelier,
-    places,
-    start,
-    with_terms,
-    without,
-)
 from jaxpanda.effects import CATALOGUE, neighbours
 from jaxpanda.effects.drive import Armature, JointSpring, TorqueRipple
 from jaxpanda.effects.friction import (
@@ -38,6 +21,23 @@ from jaxpanda.effects.friction import (
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.effects.stribeck import StribeckFriction
+from jaxpanda.inference.discrepancy import at_rest, of_known, of_law, unresolved
+from jaxpanda.inference.evidence import Design, Noise
+from jaxpanda.inference.state import (
+    State,
+    evidence,
+    gains,
+    in_noise,
+    likelier,
+    places,
+    start,
+    with_terms,
+    without,
+)
+from jaxpanda.search.events import swept
+from jaxpanda.search.premises import pose
+from jaxpanda.search.proposals import grids
+from jaxpanda.search.steps import exchange, posterior, prune, remade, search
 from jaxpanda.traces import prepare, trajectory
 
 DAMPING = 20.0
@@ -364,8 +364,8 @@ def test_friction_is_neither_exchanged_nor_dropped_for_what_is_less_likely_in_it
     other = with_terms(problem, [offset])
     assert likelier((problem, state), (problem, other)) < 0
     tempting = lambda *_: ([(1e6, (offset,)), (0.0, (state.terms[0],))], False)
-    monkeypatch.setattr("jaxpanda.diagnosis.search.instead", tempting)
-    monkeypatch.setattr("jaxpanda.diagnosis.search.gains", lambda *_: [-1e6])
+    monkeypatch.setattr("jaxpanda.search.steps.instead", tempting)
+    monkeypatch.setattr("jaxpanda.search.steps.gains", lambda *_: [-1e6])
     assert exchange(problem, state, lambda _: None) is state
     assert prune(problem, state, lambda _: None) is state
 

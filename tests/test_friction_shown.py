@@ -9,9 +9,9 @@ import pytest
 
 from jaxpanda import Arm, Recording
 from jaxpanda.corrected import Corrected
-from jaxpanda.diagnosis.friction_shown import friction_shown
 from jaxpanda.effects.sensing import TimeDelay, TorqueGain
 from jaxpanda.errors import InputError
+from jaxpanda.inference.friction_shown import friction_shown
 from jaxpanda.prediction.predict import predicted
 from jaxpanda.traces import prepare, trajectory
 

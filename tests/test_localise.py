@@ -7,9 +7,9 @@ import pytest
 
 from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis.localise import change_points, localise, since_reversal, unbiased
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.problem import Problem
 from jaxpanda.effects import Motion
+from jaxpanda.inference.problem import Problem
+from jaxpanda.search.premises import pose
 from jaxpanda.traces import prepare
 
 AR = np.array([0.7, -0.2, 0.1])

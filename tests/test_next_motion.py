@@ -14,16 +14,16 @@ from jaxpanda import Arm, Recording
 from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.arms.markup import parse
 from jaxpanda.arms.source import from_document
-from jaxpanda.diagnosis.coverage import held_out_gains, least_shown
 from jaxpanda.diagnosis.finding import Finding
 from jaxpanda.diagnosis.motions import Surroundings, motions
 from jaxpanda.diagnosis.next_motion import NOTHING, next_motion
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.problem import Problem
-from jaxpanda.diagnosis.proposals import grids
-from jaxpanda.diagnosis.state import with_terms
 from jaxpanda.effects.friction import ViscousFriction
 from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.inference.problem import Problem
+from jaxpanda.inference.state import with_terms
+from jaxpanda.search.coverage import held_out_gains, least_shown
+from jaxpanda.search.premises import pose
+from jaxpanda.search.proposals import grids
 from jaxpanda.simulation import FourierTrajectory, JointFriction, Sensors, random_trajectory, simulate
 from jaxpanda.traces import prepare
 from jaxpanda.workspace.scene import CLEARANCE, reach_of, scene_of

@@ -13,10 +13,10 @@ from jaxpanda_kernels import rnea
 from jaxpanda import Arm, InputError, Recording
 from jaxpanda.diagnosis import diagnose
 from jaxpanda.diagnosis.diagnosis import _unheard
-from jaxpanda.diagnosis.evidence import Noise, levelled
-from jaxpanda.diagnosis.noise import DETAILS, as_sharp_as_shown, borne_out
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.state import _levelled_squares, beyond, mean_squares, slow_errors, start
+from jaxpanda.inference.evidence import Noise, levelled
+from jaxpanda.inference.noise import DETAILS, as_sharp_as_shown, borne_out
+from jaxpanda.inference.state import _levelled_squares, beyond, mean_squares, slow_errors, start
+from jaxpanda.search.premises import pose
 from jaxpanda.traces import prepare
 
 ARM = Arm.panda()

@@ -14,9 +14,6 @@ import pytest
 import jaxpanda
 from jaxpanda import Arm, Corrected, InputError, Recording, diagnose, predict
 from jaxpanda.diagnosis import page
-from jaxpanda.diagnosis.events import windows
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.state import start
 from jaxpanda.effects import (
     AbstractArmEffect,
     AbstractInstantEffect,
@@ -26,6 +23,9 @@ from jaxpanda.effects import (
     Shape,
     catalogue_with,
 )
+from jaxpanda.inference.state import start
+from jaxpanda.search.events import windows
+from jaxpanda.search.premises import pose
 from jaxpanda.traces import prepare
 
 

@@ -7,11 +7,12 @@ import pytest
 
 from jaxpanda import Arm, diagnose
 from jaxpanda.arms.export import panda_mjcf
-from jaxpanda.diagnosis import diagnosis, premises
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.problem import Problem
-from jaxpanda.diagnosis.state import start, with_terms
+from jaxpanda.diagnosis import diagnosis
 from jaxpanda.effects.sensing import TorqueOffset
+from jaxpanda.inference.problem import Problem
+from jaxpanda.inference.state import start, with_terms
+from jaxpanda.search import premises
+from jaxpanda.search.premises import pose
 from jaxpanda.simulation import JointFriction, Sensors, random_trajectory, simulate
 from jaxpanda.traces import prepare
 

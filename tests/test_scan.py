@@ -10,17 +10,17 @@ import scipy.linalg
 from jaxpanda import Arm, Recording, validation
 from jaxpanda import signals as signals_
 from jaxpanda.arms import arm as arm_
-from jaxpanda.diagnosis import search
-from jaxpanda.diagnosis.events import Proposal
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.problem import Problem
-from jaxpanda.diagnosis.shapes import _score
 from jaxpanda.effects import Channels, Motion, Stretches, joint_columns
 from jaxpanda.effects import effect as effect_
 from jaxpanda.effects import motion as motion_
 from jaxpanda.effects.drive import TorqueRipple
 from jaxpanda.effects.friction import CoulombFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
+from jaxpanda.inference.problem import Problem
+from jaxpanda.search import steps
+from jaxpanda.search.events import Proposal
+from jaxpanda.search.premises import pose
+from jaxpanda.search.shapes import _score
 from jaxpanda.traces import prepare
 
 
@@ -136,10 +136,10 @@ def test_noise_is_estimated_anew_only_where_a_term_acts(problem: Problem):
 
 def test_a_term_defends_its_place_with_its_own_shape(problem: Problem):
     """What the scan finds of its kind is not always refined; the term's shape may be likelier by far."""
-    state = search.with_terms(problem, [problem.term(TorqueRipple(3, 33.7, "one"), np.array([1.0, 1.0]))])
-    found, _ = search.instead(problem, state, 0)
+    state = steps.with_terms(problem, [problem.term(TorqueRipple(3, 33.7, "one"), np.array([1.0, 1.0]))])
+    found, _ = steps.instead(problem, state, 0)
     (gained,) = [gained for gained, terms in found if terms == state.terms]
-    assert gained == pytest.approx(search.gains(problem, state)[0])
+    assert gained == pytest.approx(steps.gains(problem, state)[0])
 
 
 def test_laws_that_oppose_each_other_are_refused(problem: Problem, monkeypatch):
@@ -155,9 +155,9 @@ def test_laws_that_oppose_each_other_are_refused(problem: Problem, monkeypatch):
     added = Proposal(laws[1], 0.0, 0.0, large, ())
     left = np.concatenate(posed.residual)[:, 3]
     assert np.sqrt(np.mean(left**2)) < 10.0
-    chosen = lambda: search.choices(posed, terms, posed.design(terms, noise), noise, [added])
+    chosen = lambda: steps.choices(posed, terms, posed.design(terms, noise), noise, [added])
     assert not chosen()
-    monkeypatch.setattr(search, "LARGEST", np.inf)
+    monkeypatch.setattr(steps, "LARGEST", np.inf)
     ((gained, _),) = chosen()
     assert gained > 100.0
 
@@ -170,9 +170,9 @@ def test_what_cannot_be_gives_way_to_what_comes_after_it(problem: Problem, monke
     proposals = [
         Proposal(law, evidence, evidence, size, ()) for law, evidence in ((first, 500.0), (second, 5.0))
     ]
-    chosen = lambda: search.choices(problem, (), problem.design((), noise), noise, proposals)
+    chosen = lambda: steps.choices(problem, (), problem.design((), noise), noise, proposals)
     assert {term.effect.joints for _, (term,) in chosen()} == {(3,)}  # the other is far less likely
-    monkeypatch.setattr(search, "is_possible", lambda term, _: term.effect.joints != (3,))
+    monkeypatch.setattr(steps, "is_possible", lambda term, _: term.effect.joints != (3,))
     assert {term.effect.joints for _, (term,) in chosen()} == {(1,)}
 
 

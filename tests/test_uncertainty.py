@@ -5,15 +5,15 @@ import pytest
 from helpers import excitation, half_correlated
 
 from jaxpanda import Arm, Recording
-from jaxpanda.diagnosis.events import Proposal
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.shapes import first_steps, refine, score
-from jaxpanda.diagnosis.state import places, start, with_terms
-from jaxpanda.diagnosis.uncertainty import covariances, leaning, polished
 from jaxpanda.effects import AbstractEffect, Motion
 from jaxpanda.effects.drive import TorqueRipple
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.stribeck import StribeckBristles, StribeckFriction
+from jaxpanda.inference.state import places, start, with_terms
+from jaxpanda.search.events import Proposal
+from jaxpanda.search.premises import pose
+from jaxpanda.search.shapes import first_steps, refine, score
+from jaxpanda.search.uncertainty import covariances, leaning, polished
 from jaxpanda.traces import prepare
 
 ARM = Arm.panda()

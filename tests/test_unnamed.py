@@ -14,10 +14,10 @@ from jaxpanda import Arm, Recording
 from jaxpanda.diagnosis import diagnose
 from jaxpanda.diagnosis.calibration import calibrated
 from jaxpanda.diagnosis.diagnosis import fit
-from jaxpanda.diagnosis.events import swinging
-from jaxpanda.diagnosis.premises import pose
-from jaxpanda.diagnosis.state import start
 from jaxpanda.diagnosis.unnamed import held_off, hum, standing_off, stuck
+from jaxpanda.inference.state import start
+from jaxpanda.search.events import swinging
+from jaxpanda.search.premises import pose
 from jaxpanda.signals import prepare
 from jaxpanda.traces import prepare as prepare_trace
 

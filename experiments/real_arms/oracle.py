@@ -8,10 +8,10 @@ import numpy as np
 from jaxpanda import signals
 from jaxpanda.diagnosis import Diagnosis
 from jaxpanda.diagnosis.diagnosis import fit
-from jaxpanda.diagnosis.problem import FOLDS, Problem, Term
-from jaxpanda.diagnosis.search import search
-from jaxpanda.diagnosis.state import with_terms
 from jaxpanda.effects import AbstractEffect
+from jaxpanda.inference.problem import FOLDS, Problem, Term
+from jaxpanda.inference.state import with_terms
+from jaxpanda.search.steps import search
 
 _LOOSE = 30.0
 """Prior deviation of an oracle's coefficients, in units of the noise: it is told which effects, not how large."""

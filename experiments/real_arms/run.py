@@ -17,12 +17,12 @@ from oracle import cross_validated, held_out_rmse, nested
 
 from jaxpanda import session
 from jaxpanda.diagnosis import Diagnosis, diagnose
-from jaxpanda.diagnosis.knowledge import Knowledge
 from jaxpanda.effects import AbstractEffect
 from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
 from jaxpanda.effects.load import GravityDirection, Payload
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TimeDelay, TorqueOffset
+from jaxpanda.inference.knowledge import Knowledge
 from jaxpanda.recordings import Recording, load
 
 Oracle = Callable[..., Sequence[AbstractEffect]]

@@ -13,6 +13,7 @@ from ..corrected import KIND, XML
 from ..errors import InputError
 from ..files import output_folder
 from ..host import on_host
+from ..inference.knowledge import Knowledge
 from ..reading import Reading
 from ..recordings import Recording, distinct, load_many
 from ..rollout import compare
@@ -20,7 +21,6 @@ from ..session import telling
 from . import meaning, page, resting, two_sided
 from .diagnosis import Diagnosis
 from .entry import diagnosed
-from .knowledge import Knowledge
 
 
 @on_host

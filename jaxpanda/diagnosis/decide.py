@@ -10,12 +10,12 @@ from jaxtyping import Float
 
 from ..arms.arm import joints_named
 from ..effects import UNNAMED, law_of
+from ..inference.problem import Problem, Term
+from ..inference.state import State, coefficients, foretelling, leftover, torque, without
+from ..search.steps import posterior
+from ..search.uncertainty import covariances, leaned
 from .calibration import SUREST
 from .finding import Finding, joined
-from .problem import Problem, Term
-from .search import posterior
-from .state import State, coefficients, foretelling, leftover, torque, without
-from .uncertainty import covariances, leaned
 from .unnamed import held_off, hum, standing_off, stuck
 
 LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05

@@ -19,27 +19,27 @@ from ..arms.mjcf import MjcfSource
 from ..corrected import KIND, Corrected
 from ..effects import UNNAMED, AbstractEffect, law_of
 from ..host import on_host
+from ..inference import knowledge as knowledge_
+from ..inference.friction_shown import friction_shown
+from ..inference.noise import as_sharp_as_shown
+from ..inference.problem import FOLDS, Problem, Term
+from ..inference.state import State, with_terms
 from ..posterior import FILE as POSTERIOR_FILE
 from ..prediction.as_recorded import as_recorded, misleading
 from ..recordings import Recording
+from ..search.coverage import HeatMap, Least, heat_map, least_shown
+from ..search.premises import Premises, settled
+from ..search.steps import stand_ins, transferable
+from ..search.uncertainty import polished
 from ..session import Say
 from ..traces import Trace, trajectory
-from . import knowledge as knowledge_
 from . import saved
 from .calibration import SMALL, TOLD, are_told, calibrated, stands_out
-from .coverage import HeatMap, Least, heat_map, least_shown
 from .decide import DOUBTFUL, coefficients, findings, numbers, partly, worded
 from .finding import VERDICTS, Finding, Fit
-from .friction_shown import friction_shown
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
-from .noise import as_sharp_as_shown
 from .posterior import posterior_of
-from .premises import Premises, settled
-from .problem import FOLDS, Problem, Term
-from .search import stand_ins, transferable
-from .state import State, with_terms
-from .uncertainty import polished
 from .unnamed import standing_off
 from .written import buildable
 

@@ -16,10 +16,10 @@ from ..arms.source import from_document, from_mjcf
 from ..effects import AbstractEffect, catalogue_with
 from ..errors import InputError, require_x64
 from ..host import on_host
+from ..inference import knowledge as knowledge_
 from ..recordings import Recording, distinct, load
 from ..session import Say, silent
 from ..traces import Trace, prepare, work_rate
-from . import knowledge as knowledge_
 from .diagnosis import Diagnosis, sought
 from .meaning import Misread, misread
 from .resting import AtRest, judge, rests, while_still
@@ -48,7 +48,7 @@ def diagnose(
         model: the simulation (MJCF) as the user has it; None for the project's own Panda.
         recordings: of the arm, with torque.
         reference: recordings of the same arm from when nothing was wrong; what they show is not reported.
-        knowledge: how well the model's numbers are known; `jaxpanda.diagnosis.knowledge` explains the words.
+        knowledge: how well the model's numbers are known; `jaxpanda.inference.knowledge` explains the words.
         gravity: in place of the model's, in the frame of its world [m/s²].
         effects: classes of your own that are tried beside the catalogue's; `Corrected.load`, `predict` and
             `replay` take them too. They are not tried on an arm that holds still.

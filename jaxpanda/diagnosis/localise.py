@@ -21,9 +21,9 @@ import scipy.stats
 from jaxtyping import Float
 
 from ..effects import SIGN_WIDTH, least_order
+from ..inference.evidence import Design, Noise
+from ..inference.problem import Problem, Term
 from ..traces import Trace
-from .evidence import Design, Noise
-from .problem import Problem, Term
 
 ALARM = 0.01
 """Probability that noise alone shows anything at all in one kind of test, all joints together."""

@@ -9,12 +9,12 @@ import numpy as np
 from .. import summaries
 from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
+from ..inference.knowledge import Knowledge
 from ..meaning import Meaning, borne_out, meaning
 from ..recordings import Recording
 from ..report import Section
 from ..traces import Trace
 from .finding import Finding, Fit
-from .knowledge import Knowledge
 from .saved import AbstractAsItIs
 
 EQUATIONS = {

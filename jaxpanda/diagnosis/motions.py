@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from ..arms.mjcf import MjcfSource
 from ..errors import InputError
+from ..inference.problem import Problem
 from ..traces import Trace
 from ..workspace.scene import CLEARANCE, scene_of
-from .problem import Problem
 
 _DWELL = 0.5
 """Rests between moves [s]."""

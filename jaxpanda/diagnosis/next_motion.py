@@ -28,17 +28,17 @@ from .. import files
 from ..arms.mjcf import MjcfSource
 from ..effects import UNNAMED, AbstractEffect, Channels, Motion
 from ..host import parallel
+from ..inference.evidence import Noise
+from ..inference.knowledge import Knowledge, nuisance
+from ..inference.library import columns_of
+from ..inference.problem import Problem, Term, posed
+from ..inference.state import State, coefficients, independent
+from ..search.events import Proposal, swept
+from ..search.proposals import grids
 from ..traces import TRIM, Trace, held_sign
 from .decide import DOUBTFUL
-from .events import Proposal, swept
-from .evidence import Noise
 from .finding import Finding
-from .knowledge import Knowledge, nuisance
-from .library import columns_of
 from .motions import Surroundings, motions
-from .problem import Problem, Term, posed
-from .proposals import grids
-from .state import State, coefficients, independent
 
 WORTH = 0.05
 """Probability from which a rival is worth an experiment."""

@@ -12,13 +12,13 @@ from jaxtyping import Float
 from .. import summaries
 from ..arms.arm import Arm, joints_named
 from ..effects import AbstractEffect
+from ..inference.state import coefficients
 from ..report import Figure, Listing, Section, Table, number
 from ..versions import version
 from .diagnosis import NEXT_MOTION, Diagnosis
 from .finding import Finding
 from .localise import REGIMES, Localisation, lag_profile, order_spectrum, since_reversal
 from .next_motion import NOTHING, Told
-from .state import coefficients
 from .two_sided import TwoSided
 from .unnamed import sines
 

@@ -8,10 +8,10 @@ import scipy.linalg
 
 from ..feasible import Bounds
 from ..feasible.nearest import are_buildable
+from ..inference import knowledge as knowledge_
+from ..inference.state import places
 from ..posterior import Posterior
-from . import knowledge as knowledge_
-from .state import places
-from .uncertainty import joint, leaned
+from ..search.uncertainty import joint, leaned
 
 if TYPE_CHECKING:
     from .diagnosis import Diagnosis

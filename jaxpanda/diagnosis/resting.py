@@ -35,11 +35,11 @@ from ..arms.mjcf import MjcfSource
 from ..corrected import Corrected
 from ..effects import CATALOGUE, UNNAMED, AbstractEffect, LawAtRest, Levels, Motion, may_carry
 from ..errors import InputError
+from ..inference.knowledge import Knowledge, inertial_spread
 from ..recordings import Recording
 from ..report import Figure, Section, Table, number
 from ..traces import TRIM, Trace
 from .finding import Finding, Fit
-from .knowledge import Knowledge, inertial_spread
 from .localise import ALARM
 from .saved import AbstractAsItIs
 from .unnamed import UNSURE

@@ -11,8 +11,8 @@ from ..arms import markup
 from ..arms.export import missing_assets, write_document
 from ..arms.mjcf import MjcfSource
 from ..corrected import FILE, KIND, XML, Corrected
+from ..inference.knowledge import Knowledge
 from .finding import Finding, Fit
-from .knowledge import Knowledge
 
 
 @runtime_checkable

@@ -19,12 +19,12 @@ from scipy.signal.windows import hann
 
 from ..arms.arm import joints_named
 from ..effects import UNNAMED, may_carry
+from ..inference.problem import Problem
+from ..inference.state import State, coefficients, mean_squares, misfit
 from ..signals import Signals, white_noise
 from ..traces import Trace
 from .calibration import SUREST
 from .finding import Finding, joined
-from .problem import Problem
-from .state import State, coefficients, mean_squares, misfit
 
 BEYOND = 4.0
 """Mean square of a joint's error, over its noise's, from which it cannot be noise though nothing explains it."""

@@ -19,10 +19,10 @@ from ..effects import AbstractEffect
 from ..effects.native import nearest
 from ..errors import InputError
 from ..feasible.nearest import are_buildable, nearest_buildable
+from ..inference.problem import Problem
 from ..parameters import triangle
 from ..recordings import Recording
 from ..validation import torque_rmse
-from .problem import Problem
 
 UNSEEN = 0.5
 """Torque over the noise by which links may differ from those found, so that they can be built."""

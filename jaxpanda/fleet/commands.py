@@ -7,9 +7,9 @@ from typing import Any
 
 from ..arms.source import from_mjcf
 from ..convention import PLAIN, Convention
-from ..diagnosis.knowledge import Knowledge, check
 from ..errors import InputError, require_x64
 from ..files import output_folder
+from ..inference.knowledge import Knowledge, check
 from ..reading import Reading
 from ..session import Tick, progress
 from .crew import crew, ray

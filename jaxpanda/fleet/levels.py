@@ -4,7 +4,7 @@ A finding is there in one recording and not in the next, as chance has it near t
 findings alone would be one of chance. So the same few laws are fitted to every recording: viscous and Coulomb
 friction and a constant at each joint, and a body at the flange, all at once, beside what the model's numbers may
 be off. They are corrections to the user's model, with deviations as the diagnosis makes them
-(`diagnosis.uncertainty`). What a recording does not tell is left out.
+(`search.uncertainty`). What a recording does not tell is left out.
 """
 
 import dataclasses
@@ -14,15 +14,15 @@ import numpy as np
 from jaxtyping import Float
 
 from ..diagnosis import Diagnosis
-from ..diagnosis.knowledge import Knowledge
-from ..diagnosis.premises import pose
-from ..diagnosis.problem import Problem
-from ..diagnosis.state import independent, places, with_terms
-from ..diagnosis.uncertainty import covariances
 from ..effects import AbstractEffect
 from ..effects.friction import CoulombFriction, ViscousFriction
 from ..effects.load import Payload
 from ..effects.sensing import TorqueOffset
+from ..inference.knowledge import Knowledge
+from ..inference.problem import Problem
+from ..inference.state import independent, places, with_terms
+from ..search.premises import pose
+from ..search.uncertainty import covariances
 
 TURNS = 0.02
 """Speed over which the Coulomb level builds up [rad/s]."""

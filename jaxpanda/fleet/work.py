@@ -23,10 +23,10 @@ from ..arms.source import from_mjcf
 from ..convention import PLAIN, Convention
 from ..diagnosis import Diagnosis
 from ..diagnosis.entry import diagnosed
-from ..diagnosis.knowledge import Knowledge
 from ..errors import InputError
 from ..files import to_json
 from ..host import on_host, return_freed
+from ..inference.knowledge import Knowledge
 from ..reading import Reading
 from ..recordings import distinct, load_many
 from .levels import estimates

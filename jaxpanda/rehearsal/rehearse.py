@@ -22,15 +22,15 @@ from ..arms.mjcf import MjcfSource
 from ..arms.model_file import Model
 from ..arms.source import from_document, from_mjcf, is_panda
 from ..diagnosis import diagnose as diagnose_
-from ..diagnosis.coverage import least_shown
-from ..diagnosis.premises import pose
-from ..diagnosis.state import start
 from ..errors import InputError, require_x64
 from ..feasible.nearest import are_buildable
 from ..identification import identify
 from ..identification.result import RELIABLE
+from ..inference.state import start
 from ..recordings import Recording
 from ..rollout import engine_model
+from ..search.coverage import least_shown
+from ..search.premises import pose
 from ..session import Say, silent
 from ..signals import prepare
 from ..simulation import JointFriction, Sensors, SplineTrajectory, panda_sensors, simulate, with_sensors

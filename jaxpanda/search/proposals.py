@@ -8,12 +8,12 @@ import numpy as np
 
 from ..effects import AbstractEffect
 from ..host import parallel
-from .alike import one_more
+from ..inference.alike import one_more
+from ..inference.evidence import Design, Noise, log_mean_exp
+from ..inference.library import Candidates
+from ..inference.problem import Problem
 from .credible import is_credible
 from .events import Proposal, swept, swinging, windows
-from .evidence import Design, Noise, log_mean_exp
-from .library import Candidates
-from .problem import Problem
 from .shapes import evidence_of, first_steps, refine
 
 _REFINED = 4

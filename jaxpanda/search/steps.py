@@ -13,15 +13,11 @@ import numpy as np
 import scipy.special
 
 from ..effects import law_of
-from .alike import TEMPERATURE, joints_with, one_more, shared
-from .credible import fitted
-from .discrepancy import unresolved
-from .events import Proposal
-from .evidence import Design, Noise
-from .problem import Problem, Term
-from .proposals import at_others, by_place, grids, plainer, ranked, with_prior
-from .shapes import evidence_of, first_steps, refine
-from .state import (
+from ..inference.alike import TEMPERATURE, joints_with, one_more, shared
+from ..inference.discrepancy import unresolved
+from ..inference.evidence import Design, Noise
+from ..inference.problem import Problem, Term
+from ..inference.state import (
     State,
     beside,
     coefficients,
@@ -34,6 +30,10 @@ from .state import (
     with_terms,
     without,
 )
+from .credible import fitted
+from .events import Proposal
+from .proposals import at_others, by_place, grids, plainer, ranked, with_prior
+from .shapes import evidence_of, first_steps, refine
 
 OPPOSED = 20.0
 """How many times the torque of a law its parts may be."""

@@ -24,11 +24,11 @@ from scipy.signal import lfilter
 
 from ..effects import AbstractEffect
 from ..identification import statistics
-from .evidence import Design
-from .noise import autoregression, moments
-from .problem import Problem, Term
+from ..inference.evidence import Design
+from ..inference.noise import autoregression, moments
+from ..inference.problem import Problem, Term
+from ..inference.state import State, coefficients, in_noise, places, torque
 from .shapes import first_steps, moved, within
-from .state import State, coefficients, in_noise, places, torque
 
 _STEP_LOG, _STEP_SHARE, _STEP_TIME = 0.02, 0.002, 0.01
 """Steps of the differences: of a logarithm, as a share of the bounds, and of an instant [s]."""

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
+from ..inference.evidence import Design, Noise
+from ..inference.problem import Problem
+from ..inference.state import left_over
 from .events import Proposal
-from .evidence import Design, Noise
-from .problem import Problem
 from .shapes import clock, projection
-from .state import left_over
 
 _GIVEN = 0.2
 AFRESH = 0.1

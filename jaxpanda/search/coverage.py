@@ -15,12 +15,12 @@ import scipy.linalg
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
+from ..inference.evidence import Design, Noise
+from ..inference.library import Candidates
+from ..inference.problem import Problem
+from ..inference.state import State
 from .events import Proposal, swept
-from .evidence import Design, Noise
-from .library import Candidates
-from .problem import Problem
 from .proposals import grids
-from .state import State
 
 _PAID = 7.0
 """What a search over shapes, sizes and places costs an effect, about [nats]."""

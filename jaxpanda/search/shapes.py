@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect
+from ..inference.evidence import Design, Noise, gram, log_bayes, log_mean_exp
+from ..inference.library import form_of
+from ..inference.problem import Problem
+from ..inference.scan import scales_of
 from .events import BIN, Proposal
-from .evidence import Design, Noise, gram, log_bayes, log_mean_exp
-from .library import form_of
-from .problem import Problem
-from .scan import scales_of
 
 _ROUNDS = 3
 _SHORTER, _ENOUGH = 0.35, 0.05

@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import CATALOGUE, AbstractEffect
+from ..inference import knowledge as knowledge_
+from ..inference.grid import Grid
+from ..inference.noise import Saturation
+from ..inference.problem import Problem, Term, posed
+from ..inference.state import State, gains, in_noise, likelier, with_terms
 from ..traces import Trace
-from . import knowledge as knowledge_
-from .grid import Grid
-from .noise import Saturation
-from .problem import Problem, Term, posed
-from .search import laws, search, transferable
-from .state import State, gains, in_noise, likelier, with_terms
+from .steps import laws, search, transferable
 
 RUNGS: tuple[tuple[knowledge_.Knowledge, float, float], ...] = (
     ("identified", 1.0, 0.0),

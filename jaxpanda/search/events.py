@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from ..effects import AbstractEffect, Sweep
 from ..host import parallel
-from .evidence import PHYSICAL_SCALES, SCALES, Design, Noise, levelled, log_bayes, log_mean_exp
-from .problem import Problem
+from ..inference.evidence import PHYSICAL_SCALES, SCALES, Design, Noise, levelled, log_bayes, log_mean_exp
+from ..inference.problem import Problem
 
 BIN = 0.1
 """Resolution of the scan over time [s]."""
