@@ -40,6 +40,7 @@ def conversion(made: Any) -> Sequence[Section]:
 def identification(found: Any) -> Sequence[Section]:
     """Coefficients with their deviations, friction, and what is left unexplained."""
     names = found.joint_names or [f"joint {i + 1}" for i in range(found.dof)]
+    unit = _unit(found.model)
     sentences = [
         f"{len(found.beta)} base parameters (rank {found.rank}, condition number "
         f"{number(found.condition_number)}) leave {number(found.relative_error_percent)} % of the data "
@@ -53,11 +54,11 @@ def identification(found: Any) -> Sequence[Section]:
     sentences += _repairs(found.repairs) + list(found.notes)
     tables = [_coefficients(found)]
     if found.friction is not None and found.friction.parameters:
-        tables.append(_friction(found.friction, names))
+        tables.append(_friction(found.friction, names, unit))
     if found.rmse is not None:
         tables.append(
             by_joint(
-                "Torque error at each joint [N m]",
+                f"Torque error at each joint [{unit('N m')}]",
                 names,
                 {"fitted": found.rmse, "held out": found.cross_validated_rmse, "noise floor": found.noise},
             )
@@ -78,13 +79,18 @@ def _coefficients(found: Any) -> Table:
     return Table(["coefficient", "value", "std", "std/value", ""], rows, "Base parameters [kg m², kg m]")
 
 
-def _friction(friction: Any, names: Sequence[str]) -> Table:
+def _unit(arm: Any) -> Callable[[str], str]:
+    """The unit of a number at an arm's joints, given that where they turn; that one where no arm is known."""
+    return (lambda turning: turning) if arm is None else arm.unit
+
+
+def _friction(friction: Any, names: Sequence[str], unit: Callable[[str], str]) -> Table:
     from .friction import UNITS
 
     columns = ["joint"]
     cells: list[list[str]] = [[name] for name in names]
     for parameter, values in friction.parameters.items():
-        columns.append(f"{parameter} [{UNITS[parameter]}]")
+        columns.append(f"{parameter} [{unit(UNITS[parameter])}]")
         deviations = None if friction.std is None else friction.std.get(parameter)
         for i, value in enumerate(values):
             spread = "" if deviations is None or not np.isfinite(deviations[i]) else f" ± {deviations[i]:.2g}"
@@ -146,7 +152,7 @@ def retrieval(links: Any) -> Sequence[Section]:
                     open_,
                     "Over these links and the starts that are as good as the best",
                 ),
-                *_errors(document),
+                *_errors(document, _unit(links.model)("N m")),
             ],
             figures,
         )
@@ -169,12 +175,12 @@ def _explained(document: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _errors(document: Mapping[str, Any]) -> list[Table]:
+def _errors(document: Mapping[str, Any], force: str) -> list[Table]:
+    if not document["rmse"]:
+        return []
     columns = {"fitted": document["rmse"], "held out": document["cross_validated_rmse"]}
     names = [link["name"] for link in document["links"]]
-    return (
-        [by_joint("Torque error at the joint of each link [N m]", names, columns)] if document["rmse"] else []
-    )
+    return [by_joint(f"Torque error at the joint of each link [{force}]", names, columns)]
 
 
 def export(written: Any) -> Sequence[Section]:
@@ -204,24 +210,27 @@ def _short(value: str | None) -> str | None:
 def validation(checked: Any) -> Sequence[Section]:
     """Agreement of three inverse dynamics, torque error and tracking."""
     document = checked.to_json()
-    apart = f"kernel against MuJoCo {number(document['kernel_vs_mujoco'], 2)} N m"
+    unit = checked.arm.unit
+    force = unit("N m")
+    apart = f"kernel against MuJoCo {number(document['kernel_vs_mujoco'], 2)} {force}"
     if document["mjx_vs_mujoco"] is not None:
-        apart += f", MJX against MuJoCo {number(document['mjx_vs_mujoco'], 2)} N m"
+        apart += f", MJX against MuJoCo {number(document['mjx_vs_mujoco'], 2)} {force}"
     sentences = [
         f"Largest difference of inverse dynamics on the recorded states: {apart}.",
         f"Torque error on the recording: {number(document['relative_error_percent'])} %.",
         *document.get("notes", []),
     ]
-    columns: dict[str, Any] = {"torque rmse [N m]": document["rmse"]}
+    columns: dict[str, Any] = {f"torque rmse [{force}]": document["rmse"]}
     for engine, name in (("mjx", "MJX"), ("mujoco", "MuJoCo")):
         if document["rollout"][engine] is not None:
-            columns[f"tracking in {name}, rmse [rad]"] = document["rollout"][engine]["rmse_rad"]
-    names = document.get("joints") or [f"joint {i + 1}" for i in range(len(document["rmse"]))]
+            columns[f"tracking in {name}, rmse [{unit('rad')}]"] = document["rollout"][engine]["rmse_rad"]
+    names = checked.joints
+    labels = [f"{name} [{unit('N m', j)}]" for j, name in enumerate(names)]
     figures = [
         torque_figure(
             one.times,
             {"measured": one.measured, "model": one.modelled},
-            names,
+            labels,
             f"{one.name}: measured torque and the model's, both below {checked.cutoff:g} Hz, and what is left",
         )
         for one in checked.torque
@@ -308,29 +317,28 @@ def _repairs(repairs: Mapping[str, int]) -> list[str]:
 def torque_figure(
     time: Float[np.ndarray, " time"],
     curves: Mapping[str, Float[np.ndarray, "time dof"]],
-    names: Sequence[str],
+    labels: Sequence[str],
     caption: str,
 ) -> Figure:
-    """Torques of every joint over time; the second curve's difference from the first below each."""
+    """Torques of every joint over time, and beside each by how much the first is larger than the others."""
 
     def draw(canvas: Any) -> None:
-        dof = len(names)
-        axes = canvas.subplots(dof, 2, sharex=True, squeeze=False, width_ratios=[2, 1])
+        axes = canvas.subplots(len(labels), 2, sharex=True, squeeze=False, width_ratios=[2, 1])
         thin = max(1, len(time) // 1500)
         measured = next(iter(curves.values()))
-        for j in range(dof):
+        for j, named in enumerate(labels):
             for k, (label, values) in enumerate(curves.items()):
                 axes[j, 0].plot(time[::thin], values[::thin, j], label=label, color=f"C{k}")
                 if k:
                     axes[j, 1].plot(time[::thin], (measured - values)[::thin, j], color=f"C{k}", label=label)
-            axes[j, 0].set_ylabel(f"{names[j]} [N m]")
+            axes[j, 0].set_ylabel(named)
         axes[0, 0].legend(loc="upper right", ncols=len(curves))
         axes[0, 0].set_title("torque")
         axes[0, 1].set_title("what is left")
         for axis in axes[-1]:
             axis.set_xlabel("time [s]")
 
-    return Figure(draw, caption, size=(10.0, 1.5 * len(names)))
+    return Figure(draw, caption, size=(10.0, 1.5 * len(labels)))
 
 
 def outcome_figure(objective: Float[np.ndarray, " start"], lower_bound: float | None) -> Figure:

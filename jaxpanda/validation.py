@@ -102,7 +102,8 @@ class Validation:
     """How one MJCF fares; see the module's docstring for how to read it."""
 
     model: str
-    joints: tuple[str, ...]
+    arm: Arm = dataclasses.field(repr=False)
+    """What the file says of it."""
     cutoff: float
     """Of the low-pass on both sides of the torque [Hz]."""
     kernel_vs_mujoco: float
@@ -125,6 +126,11 @@ class Validation:
     rollout_difference: float | None
     """Largest difference between the two engines' roll-outs [rad]."""
     notes: tuple[str, ...]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Their names."""
+        return self.arm.joint_names
 
     def to_json(self) -> dict[str, Any]:
         """The document that `validation.json` holds; null where an engine could not run."""
@@ -213,7 +219,8 @@ def validate(
     agree = max(kernel, jax_apart or 0.0) <= limit
     if not agree:
         notes.append(
-            f"inverse dynamics differs between engines by more than {limit:.1e} N m: trust none of them here"
+            f"inverse dynamics differs between engines by more than {limit:.1e} {arm.unit('N m')}: trust none"
+            " of them here"
         )
     if np.any(arm.frictionloss):
         notes.append(
@@ -232,7 +239,7 @@ def validate(
     in_jax = _rollout_mjx(mjx, bare, tasks, law) if rollout and mjx is not None else None
     return Validation(
         model=str(model),
-        joints=arm.joint_names,
+        arm=arm,
         cutoff=cutoff,
         kernel_vs_mujoco=kernel,
         mjx_vs_mujoco=jax_apart,

@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxpanda import Arm, Recording, diagnose, identify
+from jaxpanda import Arm, Recording, diagnose, identify, retrieve, summaries, validate
 
 LEVEL, SLOPE = 8.0, 40.0
 LIFT = """<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="implicitfast"/><worldbody>
@@ -67,3 +67,21 @@ def test_identified_friction_is_that_of_the_moving_joint(slope, tmp_path):
     for name, truth, most in (("coulomb", LEVEL, 0.05), ("viscous", slope, 0.5)):
         value, std = found.parameters[name][0], found.std[name][0]
         assert abs(value - truth) < 2 * std < 2 * most
+
+
+def test_tables_of_an_arm_that_turns_and_slides_name_both_units(tmp_path):
+    """N m and rad were told of a lift."""
+    (tmp_path / "lift.xml").write_text(LIFT)
+    recording = lifted(LEVEL, SLOPE)
+    with jax.enable_x64(True):
+        found = identify(recording, Arm.from_mjcf(tmp_path / "lift.xml"))
+        links = retrieve(found, starts=8)
+        checked = validate(tmp_path / "lift.xml", [recording], in_mjx=False)
+        tables = [
+            table for one in (found, links, checked) for part in summaries.of(one) for table in part.tables
+        ]
+    told = " ".join(text for table in tables for text in (table.caption, *table.columns))
+    assert told.count("[N m or N]") == 5  # errors of each, the level and the offset of friction
+    assert "[N m s/rad or N s/m]" in told
+    assert "tracking in MuJoCo, rmse [rad or m]" in told
+    assert "[N m]" not in told
