@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxpanda.diagnosis.calibration import are_told, calibrated
+from jaxpanda.diagnosis.calibration import calibrated
 from jaxpanda.diagnosis.finding import Finding, Fit
 
 NOISE = np.array([0.1, 0.2])
@@ -92,19 +92,6 @@ def test_of_what_foretells_nothing_the_evidence_counts():
 def test_a_held_out_error_below_the_noise_counts_as_noise():
     below, at = (sure([found([1.0, 0.0])], held_out=x * NOISE) for x in (0.5, 1.0))
     assert below == at
-
-
-def test_what_is_hardly_likely_is_told_only_where_it_is_large_and_nothing_else_is():
-    fit = errors(3 * NOISE)
-    likely = found([0.15, 0.3], confidence=0.4)
-    small, large = found([0.15, 0.3], confidence=0.2), found([0.15, 0.5], confidence=0.05)
-    assert are_told([likely, small, large], fit) == [True, False, False]
-    assert are_told([small, large], fit) == [False, True]
-    assert are_told([small], fit) == [False]
-    assert are_told([dataclasses.replace(large, foretold=-1.0)], fit) == [False]
-    stuck = dataclasses.replace(small, terms=())
-    assert are_told([stuck, large], fit) == [True, True]
-    assert are_told([stuck, large, likely], fit) == [True, False, True]
 
 
 def test_the_weight_is_kept_and_probabilities_of_a_place_add_up_to_one_at_most():

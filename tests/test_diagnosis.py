@@ -600,6 +600,7 @@ def test_a_joint_that_never_moved_is_not_judged_and_that_is_said():
     found = diagnose(None, [one])
     assert not any(3 in f.joints for f in found.findings if f.effect == "torque_offset")
     assert any("joint 4 never moved" in note for note in found.notes)
+    assert found.lines()[1] == "Not judged: joint 4; the notes say why."
 
 
 @pytest.mark.slow

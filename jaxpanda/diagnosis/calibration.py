@@ -2,20 +2,20 @@ r"""From the weights of the models that were compared to a probability of being 
 
 The models compared are those of the catalogue, each with one other term in a place. What the catalogue lacks is
 not among them, so that their weights are too sure: most where something stays unexplained; where a law is small
-beside others at its joint, or beside what the model gets wrong of torque that it was not fitted to, and may be
-what those are off by; where its torque is not clear of what its coefficients may be off; and where it acts for a
-while only, when nothing else in the recordings tests it. How often findings like this one are right was counted
-in trials, simulated ones and on recordings of real arms, and a logistic regression on the count (Platt, Advances
-in Large Margin Classifiers 1999) says
+beside what the model gets wrong of torque that it was not fitted to, and may be what that is off by; where its
+torque is not clear of what its coefficients may be off; and where it acts for a while only, when nothing else in
+the recordings tests it. How often findings like this one are right was counted in trials, simulated ones and on
+recordings of real arms, and a logistic regression on the count (Platt, Advances in Large Margin Classifiers 1999)
+says
 
 $$\operatorname{logit} P = w_0 + w_1 \operatorname{logit} p
-  + w_2 \log_{10} s + w_3 \log_{10} a + w_4 f + w_5 u + w_6 e + w_7 \log_{10} z$$
+  + w_2 \log_{10} a + w_3 f + w_4 u + w_5 e + w_6 \log_{10} z$$
 
-with p the weight; s the finding's share of the squared torque of all findings at the joint where it stands out
-most; a its torque there over the held-out error; $f = \operatorname{sgn}(F) \log_{10}(1 + |F|)$ of the nats F by
-which it makes torque likelier that nothing was fitted to (`Finding.foretold`); u whether something is left
-unexplained; e whether it is a law that acts in an interval only; and z its torque there over the deviation of
-that (`Finding.torque_std`). `experiments/calibrate.py` fits w.
+with p the weight; a the finding's torque over the held-out error, at the joint where that is most;
+$f = \operatorname{sgn}(F) \log_{10}(1 + |F|)$ of the nats F by which it makes torque likelier that nothing was
+fitted to (`Finding.foretold`); u whether something is left unexplained; e whether it is a law that acts in an
+interval only; and z its torque there over the deviation of that (`Finding.torque_std`).
+`experiments/calibrate.py` fits w.
 """
 
 import dataclasses
@@ -27,14 +27,13 @@ from jaxtyping import Bool, Float
 
 from .finding import Finding, Fit
 
-WEIGHTS = (-1.68, 0.09, 0.0, 2.19, 0.93, -0.91, -1.4, 0.9)
-"""$w_0 \\ldots w_7$."""
+WEIGHTS = (-1.68, 0.09, 2.19, 0.93, -0.91, -1.4, 0.9)
+"""$w_0 \\ldots w_6$."""
 SUREST = 0.995
 """No finding is surer."""
-TOLD, SMALL = 0.25, 2.0
-"""Confidence from which a finding is told, as one that is missed costs three times what a false one does; and
-torque over the noise up to which it is small."""
-_LEAST_SHARE, _LEAST_SIZE = 1e-4, 1e-2
+TOLD = 0.25
+"""Confidence from which a finding is told, as one that is missed costs three times what a false one does."""
+_LEAST_SIZE = 1e-2
 _CLEAR = 0.3, 30.0
 """Deviations that a torque may be clear by, beyond which it makes no difference."""
 UNTOLD = 5.0
@@ -60,20 +59,6 @@ def calibrated(findings: Sequence[Finding], verdict: str, fit: Fit) -> list[Find
     return [_calibrated(f, of_one) for f, of_one in zip(findings, x, strict=True)]
 
 
-def are_told(findings: Sequence[Finding], fit: Fit) -> list[bool]:
-    """Which findings are likely enough to be right; where no effect is, those by which something is missing. What
-    is no term of a model is told always."""
-    any_likely = any(f.confidence >= TOLD for f in findings if f.terms)
-    return [not f.terms or (f.confidence >= TOLD if any_likely else stands_out(f, fit)) for f in findings]
-
-
-def stands_out(finding: Finding, fit: Fit) -> bool:
-    """Whether something is missing, be it this finding or another: its torque stands out of a joint's noise, and
-    makes torque likelier that nothing was fitted to."""
-    large = bool(np.any(finding.rms_torque > SMALL * fit.noise_floor))
-    return large and (finding.foretold is None or finding.foretold > 0)
-
-
 def _error(fit: Fit) -> Float[np.ndarray, " dof"]:
     """Of torque that nothing was fitted to, and no less than the noise [N m]."""
     return np.maximum(fit.held_out_rmse_after, fit.noise_floor)
@@ -85,9 +70,8 @@ def features(
     explained: bool,
     at_times: Bool[np.ndarray, " findings"],
     unsure: Float[np.ndarray, "findings dof"],
-) -> Float[np.ndarray, "findings 7"]:
-    r"""What tells how often a weight is right, beside the weight: 1, $\log_{10} s$, $\log_{10} a$, f, u, e and
-    $\log_{10} z$.
+) -> Float[np.ndarray, "findings 6"]:
+    r"""What tells how often a weight is right, beside the weight: 1, $\log_{10} a$, f, u, e and $\log_{10} z$.
 
     Args:
         sizes: torque of each finding at each joint over the held-out error.
@@ -96,14 +80,11 @@ def features(
         at_times: which are laws that act in an interval only.
         unsure: deviation of the torque of each, over the same error.
     """
-    squares = np.square(sizes)
-    at = squares.argmax(1)
+    at = sizes.argmax(1)
     each = np.arange(len(sizes))
-    share = squares[each, at] / np.maximum(squares.sum(0)[at], 1e-300)
     return np.stack(
         [
             np.ones(len(sizes)),
-            np.log10(np.maximum(share, _LEAST_SHARE)),
             np.log10(np.maximum(sizes[each, at], _LEAST_SIZE)),
             np.sign(foretold) * np.log10(1 + np.abs(foretold)),
             np.full(len(sizes), 0.0 if explained else 1.0),
@@ -119,7 +100,7 @@ def weight_of(posterior: float) -> float:
     return float(scipy.special.logit(np.clip(posterior, 1 - SUREST, SUREST)))
 
 
-def _calibrated(finding: Finding, x: Float[np.ndarray, " 7"]) -> Finding:
+def _calibrated(finding: Finding, x: Float[np.ndarray, " 6"]) -> Finding:
     first, own, *others = WEIGHTS
     sure = float(scipy.special.expit(own * weight_of(finding.confidence) + x @ [first, *others]))
     # what is taken from the finding goes to what nobody thought of; what it gains, the others lose

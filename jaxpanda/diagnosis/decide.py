@@ -21,8 +21,6 @@ from .unnamed import held_off, hum, standing_off, stuck
 LEFT, LEFT_CLEAR, LEFT_MAIN = 0.15, 0.1, 0.05
 """When a joint is not fully explained: this share of its squared residual beyond noise is left, more than this
 many times the noise's own, in a joint whose residual is at least this share of the largest."""
-MISLEADS = 0.1
-"""How probability falls for a law that predicts torque no better where it was not fitted."""
 MOST_ALIKE = 2
 """Terms of one effect at one place, beyond which it is not the right one: three ripples make any shape."""
 _TOUCHING = 0.15
@@ -31,8 +29,6 @@ _LISTED = 0.01
 """Probability from which a rival is listed."""
 LIKELY, SURE = 0.5, 0.9
 """Confidence from which a finding is said to be so, and from which its rivals need no mention."""
-DOUBTFUL = 0.2
-"""Confidence below which what a finding stands for counts as not explained, where it is large."""
 REFITTED = 0.9
 """Confidence that a model's numbers are wrong, where their refit explains what differs and nothing else does."""
 
@@ -42,7 +38,6 @@ def findings(
     searched: State,
     state: State,
     laws: State,
-    lost: Sequence[bool],
     missed: Float[np.ndarray, " dof"] | float = 0.0,
 ) -> list[Finding]:
     """The accepted terms as findings, those first that explain most torque, in the noise of its joint.
@@ -52,13 +47,11 @@ def findings(
         searched: the likeliest model as the search left it, by which its terms are weighed against their rivals.
         state: the same with its shapes polished.
         laws: the same without discrepancy, as the corrected model has them: what is told of torque and numbers.
-        lost: which of its terms predict torque no better where they were not fitted.
         missed: torque that the corrected model lacks [N m]; each law may have taken in some of it.
     """
     rivals = [_rivals(problem, searched, state, i) for i in range(len(state.terms))]
     groups = together(problem, state.terms)
     names = titles(state.terms)
-    doubt = np.where(lost, MISLEADS, 1.0)
     more = leaned(laws, missed + np.zeros(problem.dof))
     spread = [
         covariance + np.diag(np.pad(off, (0, len(covariance) - len(off))) ** 2)
@@ -66,7 +59,7 @@ def findings(
     ]
     helps = foretold(problem, laws, groups)
     out = [
-        _finding(problem, laws, group, names[group[0]], rivals, doubt, spread, gained)
+        _finding(problem, laws, group, names[group[0]], rivals, spread, gained)
         for group, gained in zip(groups, helps, strict=True)
     ]
     # what is in the band of the search belongs to what was found there
@@ -200,7 +193,6 @@ def _finding(
     members: Sequence[int],
     name: str,
     rivals: Sequence,
-    doubt: Float[np.ndarray, " terms"],
     covariance: Sequence[Float[np.ndarray, "_n _n"]],
     gained: float,
 ) -> Finding:
@@ -238,11 +230,9 @@ def _finding(
             equations.append(term.effect.equation)
     named = [i for i in members if state.terms[i].effect.title == name] or list(members)
     clearest = max(named, key=lambda i: rivals[i][0])
-    sure = float(doubt[clearest])
-    own = sure * rivals[clearest][2]
     same = (name, state.terms[clearest].effect.title)
     alternatives = sorted(
-        ((n, sure * p) for n, p in rivals[clearest][1].items() if n not in same and sure * p >= _LISTED),
+        ((n, p) for n, p in rivals[clearest][1].items() if n not in same and p >= _LISTED),
         key=lambda pair: -pair[1],
     )
     return Finding(
@@ -250,7 +240,7 @@ def _finding(
         joints=joints,
         recordings=tuple(names),
         intervals=intervals,
-        confidence=float(np.clip(own, 0.0, SUREST)),
+        confidence=float(np.clip(rivals[clearest][2], 0.0, SUREST)),
         alternatives=tuple(alternatives[:4]),
         equation="; ".join(equations),
         parameters=tuple(parameters),

@@ -34,8 +34,8 @@ from ..search.uncertainty import polished
 from ..session import Say
 from ..traces import Trace, trajectory
 from . import saved
-from .calibration import SMALL, TOLD, are_told, calibrated, stands_out
-from .decide import DOUBTFUL, coefficients, findings, numbers, partly, worded
+from .calibration import TOLD, calibrated
+from .decide import LIKELY, coefficients, findings, numbers, partly, worded
 from .finding import VERDICTS, Finding, Fit
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
@@ -44,8 +44,6 @@ from .unnamed import standing_off
 from .written import buildable
 
 NEXT_MOTION = "next_motion.csv"
-UNSURE = 0.6
-"""Confidence that no finding reaches where not all is taken for explained."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,8 +133,14 @@ class Diagnosis:
         return [(t.name, t.motion.time, b, a) for t, b, a in zip(traces, before, after, strict=True)]
 
     def lines(self) -> list[str]:
-        """Verdict and findings in plain sentences."""
-        return [VERDICTS[self.verdict], *saved.sentences(self.findings)]
+        """Verdict, which joints it does not speak of, and findings in plain sentences."""
+        return [VERDICTS[self.verdict], *self.not_judged, *saved.sentences(self.findings)]
+
+    @property
+    def not_judged(self) -> list[str]:
+        """A sentence about the joints that the verdict does not speak of."""
+        joints = [j for j, judged in enumerate(_judged(self.problem)) if not judged]
+        return [f"Not judged: {joints_named(joints)}; the notes say why."] if joints else []
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
         """Write diagnosis.json, corrected.xml with what it includes, corrected.json, and posterior.npz;
@@ -206,26 +210,22 @@ def sought(
         corrected = correct(kept)
     lost = [all(t is not k for k in (*kept.terms, *doubtful)) for t in laws.terms]
     fitted = fit(problem, kept)
-    found = [*findings(problem, searched, state, laws, lost, fitted.missed), *wrong]
+    found = [*findings(problem, searched, state, laws, fitted.missed), *wrong]
     more = partly(problem, state) or not all(_judged(problem))
     answer = verdict(found, fitted, more)
     told = [worded(problem, laws, f) for f in calibrated(found, answer, fitted)]
     notes = list(premises.notes)
-    likely = are_told(told, fitted)
-    if not all(likely):
-        unsure = [f for f, on in zip(told, likely, strict=True) if not on]
-        told = [f for f, on in zip(told, likely, strict=True) if on]
+    unsure = [f for f in told if f.terms and f.confidence < TOLD]
+    told = [f for f in told if all(f is not u for u in unsure)]
+    if unsure:
         notes.append(_too_unsure(unsure))
-        more = more or any(stands_out(f, fitted) for f in unsure)
-        found = [f for f, on in zip(found, likely, strict=True) if on]
-    if likely and not any(f.confidence >= TOLD for f in told):
+    if unsure and not told:
         # the user's model is as good as any, which need not be good
-        kept, more = with_terms(problem, ()), more or bool(told)
+        kept = with_terms(problem, ())
         corrected, fitted = correct(kept), fit(problem, kept)
-        if not told:
-            found = standing_off(problem, kept, ())
-            told = calibrated(found, verdict(found, fitted, more), fitted)
-    answer = verdict(found, fitted, more)
+        apart = standing_off(problem, kept, ())
+        told = calibrated(apart, verdict(apart, fitted, more), fitted)
+    answer = verdict(told, fitted, more)
     if moved and not wrong:
         notes.append(_refitted(arm, moved))
     left_out = [
@@ -435,14 +435,12 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
     if not names:
         return "consistent"
     if UNNAMED not in names:
-        doubtful = any(f.confidence < DOUBTFUL and stands_out(f, fit) for f in found)
-        missed = bool(np.any(fit.held_out_rmse_after > SMALL * fit.noise_floor))
-        unsure = missed and all(f.confidence < UNSURE for f in found)
+        doubtful = all(f.confidence < LIKELY for f in found)
         held_out = fit.held_out_rmse_before, fit.held_out_rmse_after
         before, after = (np.sum(np.square(error / fit.noise_floor)) for error in held_out)
         events_alone = all(f.intervals is not None for f in found)  # no second instance to be tested on
         helps = events_alone or after < before
-        return "partly_explained" if partly or doubtful or unsure or not helps else "explained"
+        return "partly_explained" if partly or doubtful or not helps else "explained"
     return "unexplained" if set(names) == {UNNAMED} else "partly_explained"
 
 

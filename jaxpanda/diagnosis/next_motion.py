@@ -36,7 +36,7 @@ from ..inference.state import State, coefficients, independent
 from ..search.events import Proposal, swept
 from ..search.proposals import grids
 from ..traces import TRIM, Trace, held_sign
-from .decide import DOUBTFUL
+from .calibration import TOLD
 from .finding import Finding
 from .motions import Surroundings, motions
 
@@ -253,12 +253,12 @@ def _pairs(problem: Problem, state: State, finding: Finding) -> list[_Pair]:
     i = max(finding.terms, key=lambda i: float(np.sum(state.terms[i].columns[0] ** 2)))
     term = state.terms[i]
     stands_in = finding.effect == UNNAMED and term.effect.name != UNNAMED
-    if not (rivals or none >= DOUBTFUL) or stands_in or term.effect.bound_to_recording:
+    if not (rivals or none >= TOLD) or stands_in or term.effect.bound_to_recording:
         return []
     others = (*state.terms[:i], *state.terms[i + 1 :])
     a = _Side(term.effect, coefficients(state, i), _shapes(problem, term.effect))
     sure = finding.confidence
-    out = [_Pair(a, None, others, 1.0, sure * none)] if none >= DOUBTFUL else []
+    out = [_Pair(a, None, others, 1.0, sure * none)] if none >= TOLD else []
     if not rivals:
         return out
     design = problem.design(others, state.noise)

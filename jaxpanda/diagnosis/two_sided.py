@@ -98,9 +98,10 @@ class TwoSided:
         """Verdict and findings in plain sentences."""
         where = {"link": "Behind the drives", "drive": "In the drives"}
         told = [f"{where[f.side]}: {f.summary} Confidence {f.confidence:.2f}." for f in self.findings]
+        opening = VERDICTS[self.verdict]
         if self.verdict == "consistent":
-            return ["The simulation agrees with the recordings, in the drives and behind them.", *told]
-        return [VERDICTS[self.verdict], *told]
+            opening = "The simulation agrees with the recordings, in the drives and behind them."
+        return [opening, *dict.fromkeys((*self.link.not_judged, *self.drive.not_judged)), *told]
 
     def save(self, folder: str | Path) -> tuple[str, ...]:
         """Write diagnosis.json, corrected.xml with what it includes, corrected.json, which has both sides beside
