@@ -52,6 +52,12 @@ def test_a_recording_of_another_length_compiles_nothing_new():
     assert effect_._advance._cache_size() == before
 
 
+def test_a_bias_wanders_over_periods_that_a_recording_tells_half_of(problem):
+    """In two seconds of a Kinova a bias of 6 s stood for viscous friction."""
+    periods = {e.period for g in problem.library if g.name == "torque_drift" for e in g.effects} - {0.0}
+    assert periods == {6.0}  # of up to 60; of the longer recording less than 5 s are used
+
+
 def test_another_arm_with_as_many_joints_compiles_its_dynamics_alone():
     def torques(arm: Arm, samples: int):
         s = channels(samples)

@@ -237,6 +237,11 @@ class AbstractEffect(eqx.Module):
         return self
 
     @property
+    def period(self) -> float:
+        """Of what wanders [s]; it is tried where a recording has half of it."""
+        return 0.0
+
+    @property
     def passes(self) -> bool:
         """Whether it is over with the session in which it was recorded: a drift of a sensor."""
         return self.drifts and self.acts_on == "torque"

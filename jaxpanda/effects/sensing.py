@@ -137,6 +137,10 @@ class TorqueDrift(AbstractInstantEffect):
         return dataclasses.replace(self, until=max(float(s.t[-1]) for s in recorded))
 
     @property
+    def period(self) -> float:
+        return float(self.time_constant) if self.form in ("wave", "wandering") else 0.0
+
+    @property
     def steady(self) -> tuple[TorqueOffset, ...]:
         """The bias that does not change."""
         return (TorqueOffset(self.joint),)
