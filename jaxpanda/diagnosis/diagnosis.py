@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -17,25 +16,25 @@ from ..arms.arm import Arm, joints_named
 from ..arms.export import missing_assets
 from ..arms.mjcf import MjcfSource
 from ..corrected import KIND, Corrected
-from ..effects import UNNAMED, AbstractEffect, law_of
+from ..effects import UNNAMED, AbstractEffect
 from ..host import on_host
 from ..inference import knowledge as knowledge_
 from ..inference.friction_shown import friction_shown
 from ..inference.noise import as_sharp_as_shown
-from ..inference.problem import FOLDS, Problem, Term
+from ..inference.problem import FOLDS, Problem
 from ..inference.state import State, with_terms
 from ..posterior import FILE as POSTERIOR_FILE
-from ..prediction.as_recorded import as_recorded, misleading
+from ..prediction.as_recorded import as_recorded
 from ..recordings import Recording
 from ..search.coverage import HeatMap, Least, heat_map, least_shown
-from ..search.premises import Premises, settled
-from ..search.steps import stand_ins, transferable
+from ..search.premises import settled
 from ..search.uncertainty import polished
 from ..session import Say
 from ..traces import Trace, trajectory
 from . import saved
 from .calibration import TOLD, calibrated
-from .decide import LIKELY, coefficients, findings, numbers, partly, worded
+from .correction import correction, fitted_laws
+from .decide import LIKELY, findings, numbers, partly, worded
 from .finding import VERDICTS, Finding, Fit
 from .localise import Localisation, localise, unbiased
 from .next_motion import NextMotion, next_motion
@@ -189,74 +188,42 @@ def sought(
     problem = premises.problem
     progress("refining the numbers, and weighing what else it could be")
     state = polished(problem, searched)
-    laws = _fitted_laws(problem, state)
+    laws = fitted_laws(problem, state)
     guessed = premises.knowledge not in ("exact", "identified")
     moved = numbers(problem, state, premises.changes) if guessed else []
-    # beside recordings of reference, to which they were refitted with the others, they are no news
-    wrong = moved if all(active) else []
-    kept = transferable(problem, laws)
-    if doubtful := stand_ins(problem, kept):
-        kept = with_terms(problem, [t for t in kept.terms if all(t is not d for d in doubtful)])
-    background = premises.background if kept.terms or moved else ()
-    lasting = [t for t, on in zip(premises.background, premises.lasting, strict=True) if background and on]
-    correct = lambda by: _corrected(arm, premises, lasting, by, refitted=bool(by.terms or moved))
-    corrected = correct(kept)
     motions = [trajectory(recording) for recording in recordings]
-    added = [*lasting, *kept.terms]
-    if worse := misleading(motions, corrected, len(added)):
-        gone = {id(added[i]) for i in worse}
-        lasting = [t for t in lasting if id(t) not in gone]
-        kept = with_terms(problem, [t for t in kept.terms if id(t) not in gone])
-        corrected = correct(kept)
-    lost = [all(t is not k for k in (*kept.terms, *doubtful)) for t in laws.terms]
-    fitted = fit(problem, kept)
+    made = correction(arm, premises, laws, motions, moved=bool(moved))
+    fitted = fit(problem, made.kept)
+    # beside recordings of reference, to which numbers were refitted with the others, they are no news
+    wrong = moved if all(active) else []
     found = [*findings(problem, searched, state, laws, fitted.missed), *wrong]
     more = partly(problem, state) or not all(_judged(problem))
-    answer = verdict(found, fitted, more)
-    told = [worded(problem, laws, f) for f in calibrated(found, answer, fitted)]
-    notes = list(premises.notes)
-    unsure = [f for f in told if f.terms and f.confidence < TOLD]
-    told = [f for f in told if all(f is not u for u in unsure)]
-    if unsure:
-        notes.append(_too_unsure(unsure))
+    likely = [worded(problem, laws, f) for f in calibrated(found, verdict(found, fitted, more), fitted)]
+    unsure = [f for f in likely if f.terms and f.confidence < TOLD]
+    told = [f for f in likely if all(f is not u for u in unsure)]
     if unsure and not told:
         # the user's model is as good as any, which need not be good
-        kept = with_terms(problem, ())
-        corrected, fitted = correct(kept), fit(problem, kept)
-        apart = standing_off(problem, kept, ())
+        made = dataclasses.replace(made, kept=with_terms(problem, ()))
+        fitted = fit(problem, made.kept)
+        apart = standing_off(problem, made.kept, ())
         told = calibrated(apart, verdict(apart, fitted, more), fitted)
-    answer = verdict(told, fitted, more)
-    if moved and not wrong:
-        notes.append(_refitted(arm, moved))
-    left_out = [
-        *(t for t, gone in zip(state.terms, lost, strict=True) if gone),
-        *(t for t in background if all(t is not k for k in lasting)),
-    ]
-    if left_out:
-        notes.append(
-            "left out of the corrected model, as torque is predicted no better with it where it was not fitted,"
-            f" or with all of the motion: {_laws_named(left_out)}"
-        )
-    if doubtful:
-        where = joints_named(sorted({j for t in doubtful for j in t.effect.joints}))
-        notes.append(
-            f"left out of the corrected model: the free curve at {where}, which leaves more than half of what it"
-            " is fitted to where it was not fitted"
-        )
-    corrected = as_recorded(motions, buildable(source, corrected, problem), _judged(problem))
-    repairs = [f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()]
-    made = Diagnosis(
-        verdict=answer,
+    corrected = made.model
+    predicting = as_recorded(motions, buildable(source, corrected, problem), _judged(problem))
+    diagnosis = Diagnosis(
+        verdict=verdict(told, fitted, more),
         findings=tuple(told),
         fit=fitted,
-        corrected=corrected,
+        corrected=predicting,
         written=source.document,
         notes=(
-            *notes,
-            *repairs,
+            *premises.notes,
+            *([_too_unsure(unsure)] if unsure else []),
+            *([_refitted(arm, moved)] if moved and not wrong else []),
+            *made.left_out,
+            *(f"{t.name}: {what}: {count}" for t in traces for what, count in t.signals.repairs.items()),
             *(n for t in traces for n in _still(t)),
             *_unheard(problem),
-            *_as_recorded(corrected),
+            *_as_recorded(predicting),
             *(n for t in traces for n in t.signals.notes),
         ),
         log=tuple(log),
@@ -265,27 +232,11 @@ def sought(
         source=source,
         knowledge=premises.knowledge,
         spread=premises.spread,
-        kept=kept,
+        kept=made.kept,
         scale=premises.scale,
     )
     # numbers that moved by less than torque shows stay as the user wrote them
-    return made, corrected if moved else corrected.as_written
-
-
-def _fitted_laws(problem: Problem, state: State) -> State:
-    """The laws of a model without discrepancy. Samples where a law may be off count as little as beside it, or in
-    full: at each joint as torque is predicted better that nothing was fitted to. Bristles have a law for where a
-    joint turns back; Coulomb's friction, which sticks there, has none."""
-    each = [t.law for t in state.terms], [t.exact for t in state.terms]
-    ways = [polished(problem, with_terms(problem, terms)) for terms in each]
-    spread = any(t.effect.drifts for t in state.terms)
-    left = [problem.predicted_error(s.design, ways[0].noise, spread=spread)[0] for s in ways]
-    better = left[1] < left[0]
-    which = [bool(np.all(better[t.acts])) for t in state.terms]
-    if len(set(which)) < 2:
-        return ways[bool(which) and which[0]]
-    terms = [pair[k] for k, *pair in zip(which, ways[0].terms, ways[1].terms, strict=True)]
-    return polished(problem, with_terms(problem, terms))
+    return diagnosis, corrected if moved else corrected.as_written
 
 
 def _refitted(arm: Arm, moved: Sequence[Finding]) -> str:
@@ -304,15 +255,6 @@ def _too_unsure(findings: Sequence[Finding]) -> str:
     for f in findings:
         each.append(f"{f.effect.replace('_', ' ')} at {joints_named(f.joints)} ({f.confidence:.2f})")
     return f"fits, but is hardly likely to be what is missing, and so no finding: {'; '.join(each)}"
-
-
-def _laws_named(terms: Sequence[Term]) -> str:
-    """Which laws, and of which joints."""
-    joints: dict[str, set[int]] = {}
-    for term in terms:
-        joints.setdefault(term.effect.name.replace("_", " "), set()).update(term.effect.joints)
-    where = {law: f" at {joints_named(sorted(of))}" if of else "" for law, of in joints.items()}
-    return "; ".join(law + where[law] for law in sorted(where))
 
 
 class _Log(list[str]):
@@ -442,37 +384,3 @@ def verdict(found: Sequence[Finding], fit: Fit, partly: bool) -> str:
         helps = events_alone or after < before
         return "partly_explained" if partly or doubtful or not helps else "explained"
     return "unexplained" if set(names) == {UNNAMED} else "partly_explained"
-
-
-def _corrected(
-    arm: Arm, premises: Premises, lasting: Sequence[Term], state: State, *, refitted: bool
-) -> Corrected:
-    """The arm with the terms and, where `refitted`, with what they leave of the nuisance; of what healthy
-    recordings show, with what is `lasting`."""
-    problem = premises.problem
-    x = state.design.x[: problem.nuisance[0].shape[2]] * (1.0 if refitted else 0.0)
-    change, damping, level, rotors = premises.changes(x)
-    joints = np.flatnonzero(rotors)
-    rotor = law_of("armature")
-    effects: list[AbstractEffect] = [rotor(int(j), "signed") for j in joints]  # pyright: ignore
-    values = [jnp.asarray(rotors[j])[None] for j in joints]
-    at = len(x) - sum(len(t.deviation) for t in premises.background)
-    for term in premises.background if refitted else ():
-        if any(term is t for t in lasting):
-            effects.append(term.effect)
-            values.append(jnp.asarray(x[at : at + len(term.deviation)] * term.deviation))
-        at += len(term.deviation)
-    recorded = [t.channels for t, on in zip(problem.traces, problem.active, strict=True) if on]
-    for i, term in enumerate(state.terms):
-        effects.append(term.effect.beyond(recorded))
-        values.append(jnp.asarray(coefficients(state, i)))
-    shown = problem.traces[0].friction_shown
-    return Corrected(
-        arm,
-        jnp.asarray(change),
-        jnp.asarray(damping),
-        jnp.asarray(level),
-        tuple(effects),
-        tuple(values),
-        friction_shown=None if shown is None else jnp.asarray(shown),
-    )
