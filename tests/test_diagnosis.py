@@ -862,7 +862,8 @@ def test_a_joint_that_nothing_explains_is_told_beside_what_was_found_elsewhere()
 
     found = diagnose(None, [record(20, both), record(21, damping)]).findings
     viscous = next(f for f in found if f.effect == "viscous_friction")
-    assert viscous.joints == (5,) and viscous.confidence > 0.5
+    assert viscous.joints == (5,)
+    assert viscous.confidence > 0.5
     assert any(2 in f.joints for f in found)
 
 
