@@ -5,7 +5,8 @@ mrad, and what they hold at rest depends on where the joint came from; $\tanh(\d
 many motions. And how much of fast motion the torque shows: its channel may be filtered more than q is. A
 diagnosis weighs such samples down. A prediction takes of each what is nearest to a joint's recorded torque; but
 bristles, which a single rest may speak for, only where they are nearer by more than the standard error from
-piece to piece of the recordings (Breiman et al., Classification and Regression Trees, 1984).
+piece to piece of the recordings (Breiman et al., Classification and Regression Trees, 1984), of the joint or of
+all joints together.
 """
 
 import dataclasses
@@ -20,7 +21,11 @@ from ..traces import PIECE, Trajectory, trajectory
 from .predict import predicted
 
 TURNS = (Turn("speed", 0.01), *(Turn("distance", x) for x in (3e-4, 7e-4, 1.5e-3, 3e-3, 6e-3)))
-"""How friction of a gear may turn [rad/s, rad]."""
+"""How friction of a gear may turn [rad/s, rad], beside MuJoCo's way."""
+PLAIN = 2
+"""Of these ways, the first that remember nothing: MuJoCo's and tanh."""
+_FORGOTTEN = 3 * max(turn.size for turn in TURNS if turn.over == "distance")
+"""Way from where a recording begins, after which bristles hold nothing of what they held there [rad]."""
 CUTOFFS = (40.0, 30.0, 24.0, 20.0, 17.0, 14.0, 12.0, 10.0, 8.5, 7.0, 6.0, 5.0)
 """Low-passes of the motion that are tried [Hz]."""
 LONG = 120.0
@@ -33,8 +38,8 @@ def as_recorded(whole: Sequence[Trajectory], corrected: Corrected, judged: Seque
     """The same with friction at rest, and what of fast motion each joint's torque shows, as in the recordings.
 
     Of joints that were not `judged` their own torque tells nothing of friction, which may have carried any load
-    at rest. Theirs is taken to turn as that of most others does; so is fast motion in their torque, unless that
-    shows little of it itself.
+    at rest. Theirs is taken to turn as that of the arm does; fast motion in their torque is as in most others',
+    unless that shows little of it itself.
     """
     moved = [_beginning(one) for one in whole]
     best = dataclasses.replace(corrected, turns=_turns(moved, corrected, judged))
@@ -53,24 +58,39 @@ def as_recorded(whole: Sequence[Trajectory], corrected: Corrected, judged: Seque
 def _turns(
     moved: Sequence[Trajectory], corrected: Corrected, judged: Sequence[bool]
 ) -> tuple[Turn | None, ...]:
-    """How the friction of each joint turned; where that was not judged, as in most others that rub."""
-    rubs = np.asarray(corrected.arm.frictionloss + corrected.frictionloss_change) != 0
+    """How the friction of each joint turned. Joints of one arm are alike: what their recordings say of bristles
+    together, each piece as a share of its joint's squared error, holds for those whose own say nothing of it."""
+    arm = corrected.arm
+    rubs = np.asarray(arm.frictionloss + corrected.frictionloss_change) != 0
     if not rubs.any():
         return ()
     ways = (None, *TURNS)
-    each = [dataclasses.replace(corrected, turns=(way,) * corrected.arm.dof) for way in ways]
-    pieces = np.stack([_pieces(moved, one) for one in each])
+    each = [dataclasses.replace(corrected, turns=(way,) * arm.dof) for way in ways]
+    pieces = np.stack([_pieces(moved, one, _FORGOTTEN) for one in each])
+    shares = pieces / np.maximum(pieces[0].sum(0), 1e-300)
+    known = np.asarray(judged) & rubs
+    of_arm = _nearest(shares[:, :, known].reshape(len(ways), -1)) if known.any() else 0
+    best = np.full(arm.dof, of_arm)
+    for joint in np.flatnonzero(judged):
+        own = pieces[:, :, joint]
+        nearest = _nearest(own)
+        if not of_arm >= PLAIN > nearest or _is_further(own, of_arm, nearest):
+            best[joint] = nearest
+    return tuple(ways[k] for k in best) if any(best) else ()
+
+
+def _nearest(pieces: Float[np.ndarray, "ways pieces"]) -> int:
+    """The way with the least squared error; of those that remember something only where the plain are further."""
     squares = pieces.sum(1)
-    nearest = squares.argmin(0)
-    further = pieces - np.take_along_axis(pieces, nearest[None, None], 0)
-    count = further.shape[1]
-    error = np.sqrt(count) * np.std(further, 1, ddof=1) if count > 1 else np.inf
-    # MuJoCo's and tanh, which remember nothing
-    plain = np.where(further.sum(1) <= error, squares, np.inf)[:2]
-    nearest = np.where(np.isfinite(plain).any(0), plain.argmin(0), nearest)
-    others = nearest[rubs & judged]
-    nearest[~np.asarray(judged)] = np.argmax(np.bincount(others)) if len(others) else 0
-    return tuple(ways[k] for k in nearest) if any(nearest) else ()
+    nearest = int(squares.argmin())
+    plain = [k for k in range(PLAIN) if not _is_further(pieces, k, nearest)]
+    return min(plain, key=lambda k: squares[k], default=nearest)
+
+
+def _is_further(pieces: Float[np.ndarray, "ways pieces"], way: int, than: int) -> bool:
+    """Whether a way has more squared error than another, by more than the standard error from piece to piece."""
+    further = pieces[way] - pieces[than]
+    return len(further) > 1 and bool(further.sum() > np.sqrt(len(further)) * further.std(ddof=1))
 
 
 def misleading(whole: Sequence[Trajectory], corrected: Corrected, count: int) -> set[int]:
@@ -123,13 +143,17 @@ def _squares(moved: Sequence[Trajectory], corrected: Corrected) -> Float[np.ndar
     return _pieces(moved, corrected).sum(0)
 
 
-def _pieces(moved: Sequence[Trajectory], corrected: Corrected) -> Float[np.ndarray, "pieces dof"]:
-    """The same for each piece of the recordings."""
+def _pieces(
+    moved: Sequence[Trajectory], corrected: Corrected, away: float = 0.0
+) -> Float[np.ndarray, "pieces dof"]:
+    """The same for each piece of the recordings, from when a joint has been so far away from where it was."""
     out = []
     for one, names in zip(moved, _up_to(moved), strict=True):
         trace, torque = predicted(one, corrected, names)
         assert trace.tau is not None
-        squares = (trace.tau - torque) ** 2 * (trace.weight > 0)[:, None]
+        q = np.asarray(trace.motion.q)
+        counts = (trace.weight > 0)[:, None] & (np.maximum.accumulate(np.abs(q - q[0])) >= away)
+        squares = (trace.tau - torque) ** 2 * counts
         time = trace.motion.time
         count = max(round(float(time[-1] - time[0]) / PIECE), 1)
         out += [piece.sum(0) for piece in np.array_split(squares, count)]

@@ -284,16 +284,13 @@ def exchange(problem: Problem, state: State, say: Any, free: bool = True) -> Sta
         problem.tried.update(step.tried(free, barred, _told(found)))
         term = state.terms[i]
         own = next(gained for gained, terms in found if terms[0] is term)
-        # what is hardly less likely may predict better what it was not fitted to
-        others = (c for c in found if all(t.key != term.key for t in c[1]) and c[0] > own + UNLIKELY)
-        surely = found[0][0] > own + BETTER
-        best = found[0] if surely else next(others, None)
-        if best is None:
+        best = found[0]
+        if best[0] <= own + BETTER:
             continue
         other = with_terms(problem, (*state.terms[:i], *best[1], *state.terms[i + 1 :]))
         if len(best[1]) > 1:
             other = shaped_together(problem, other, range(i, i + len(best[1])))
-        if likelier((problem, state), (problem, other)) < (0.0 if surely else BETTER):
+        if likelier((problem, state), (problem, other)) < 0:
             continue
         if [t.key for t in best[1]] != [term.key]:
             say(f"{', '.join(map(name, best[1]))} for {name(term)}: {best[0]:.1f} for {own:.1f}")
