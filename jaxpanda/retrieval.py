@@ -483,6 +483,11 @@ def _bounds(bounds: Bounds | str | Path | None, arm: Arm | None, table: Identifi
             "of the Panda, taken as no others were given, " if bounds is None and table.model is None else ""
         )
         raise InputError(f"bounds: {whose}cover {chosen.dof} links, the coefficients name link {table.dof}")
+    if (known := len(table.link_names)) not in (0, chosen.dof):
+        raise InputError(
+            f"bounds: cover {chosen.dof} links, the identified arm has {known}: give its own model (--model) or"
+            " bounds (--bounds)"
+        )
     return chosen
 
 

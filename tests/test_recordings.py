@@ -619,3 +619,38 @@ def test_units_are_looked_at_wherever_a_recording_came_from():
         prepare(dataclasses.replace(made, q=np.rad2deg(made.q) * 8, qd=None))
     with pytest.raises(InputError, match="looks like milliseconds"):
         prepare(dataclasses.replace(made, time=1e3 * made.time))
+
+
+def test_columns_that_a_user_names_make_no_log_of_libfranka(tmp_path):
+    """`time`, beside q that was named, was taken for libfranka's, in milliseconds."""
+    made = recording(samples=1500)
+    path = tmp_path / "degrees.csv"
+    save(dataclasses.replace(made, q=np.rad2deg(made.q), qd=None), path)
+    read = load(path, columns={"q": "q_{j}:deg"})
+    np.testing.assert_allclose(read.q, made.q, atol=1e-6)
+    np.testing.assert_allclose(read.time, made.time, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("columns", "scale", "cure"),
+    [
+        ({"time": "stamp", "q": "pos{j}"}, {"time": 1e3}, "--columns time=stamp:ms"),
+        (
+            {"time": "stamp", "q": "pos{j}"},
+            {"q": 8 * 180 / np.pi},
+            "--columns q=pos{j}:deg, of one joint q_3=pos3:mm",
+        ),
+        ({}, {"time": 1e3}, "--columns time=time:ms"),
+        ({}, {"q": 8 * 180 / np.pi}, "--columns q=q_{j}:deg, of one joint q_3=q_3:mm"),
+    ],
+)
+def test_a_unit_is_to_be_said_of_the_columns_that_were_read(tmp_path, columns, scale, cure):
+    made = recording(samples=1500)
+    named = {c: getattr(made, c) * scale.get(c, 1.0) for c in ("time", "q")}
+    prefix = {"time": columns.get("time", "time"), "q": columns.get("q", "q_{j}")}
+    names = [prefix["time"], *(prefix["q"].replace("{j}", str(j + 1)) for j in range(made.dof))]
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.c_[named["time"], named["q"]], delimiter=",", header=",".join(names), comments="")
+    with pytest.raises(InputError) as refused:
+        load(path, columns=columns)
+    assert cure in str(refused.value)

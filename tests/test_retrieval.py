@@ -162,6 +162,12 @@ def test_constraints_that_no_start_meets_are_an_error(quick):
         retrieve(table(), constraints=[lambda links: links.mass[:1] - 11.0], **quick)
 
 
+def of_three_links(table):
+    """An identification of another arm."""
+    masses = [{**table["coefficients"][0], "terms": {f"m{i}": 1.0}} for i in (1, 2, 3)]
+    return {"links": ["upper", "lower", "hand"], "coefficients": masses}
+
+
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
@@ -170,6 +176,7 @@ def test_constraints_that_no_start_meets_are_an_error(quick):
         (lambda t: t["coefficients"][0]["terms"].update({"m8": 1}), "link 8"),
         (lambda t: t.pop("coefficients"), "coefficients"),
         (lambda t: [row.update(reliable=False) for row in t["coefficients"]], "none is reliable"),
+        (lambda t: t.update(of_three_links(t)), "cover 7 links, the identified arm has 3"),
     ],
 )
 def test_a_malformed_table_is_refused_by_field(change, complaint):

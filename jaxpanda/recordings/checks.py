@@ -98,7 +98,8 @@ def _rate(recording: Recording) -> None:
         if fastest <= step / factor <= slowest:
             raise InputError(
                 f"{recording.name}: column time looks like {unit} (its median step is {step:g}), where "
-                f"seconds are needed: divide it by {factor:g}, or say it, as --columns time=time:{short}"
+                f"seconds are needed: divide it by {factor:g}, or say it, as --columns"
+                f" time={recording.called('time')}:{short}"
             )
     raise InputError(
         f"{recording.name}: column time has a median step of {step:g} s ({1 / step:g} Hz), where sample "
@@ -160,7 +161,8 @@ def _unwrapped(recording: Recording, row: Callable[[int], str]) -> None:
             ", where positions must be continuous: unwrap them, as numpy.unwrap(q, axis=0) does"
         )
         if np.max(np.abs(recording.q[:, j])) > 4 * _TURN:
-            cure += f"; or, if the joint slides, by millimetres, say so, as --columns q_{j + 1}=q_{j + 1}:mm"
+            cure += "; or, if the joint slides, by millimetres, say so, as"
+            cure += f" --columns {_of_joint(recording, j)}:mm"
         raise InputError(
             f"{recording.name}: column q_{j + 1}, {row(i)}: the angle jumps by a turn ({before:.4g} rad, then "
             f"{after:.4g} rad; {int(jumps.sum())} such jumps in all){cure}"
@@ -224,10 +226,21 @@ def _radians(recording: Recording) -> None:
     raise InputError(
         f"{recording.name}: column q_{j + 1} reaches {recording.q[row, j]:g} at {recording.time[row]:g} "
         "s, which looks like degrees where radians are needed, or like millimetres of a joint that slides: "
-        "multiply positions (and velocities) by pi/180, or say it, as --columns q=q_{j}:deg dq=dq_{j}:deg/s, "
-        f"of one joint q_{j + 1}=q_{j + 1}:mm; if they are radians of a joint that turns on, take whole turns off"
-        " it, or cut the recording"
+        f"multiply positions (and velocities) by pi/180, or say it, as --columns {_in_degrees(recording)}, "
+        f"of one joint {_of_joint(recording, j)}:mm; if they are radians of a joint that turns on, take whole"
+        " turns off it, or cut the recording"
     )
+
+
+def _of_joint(recording: Recording, j: int) -> str:
+    """How `--columns` says one joint's position, its unit to follow."""
+    return f"q_{j + 1}={recording.called(f'q_{j + 1}')}"
+
+
+def _in_degrees(recording: Recording) -> str:
+    """How `--columns` says that positions, and velocities where there are any, are in degrees."""
+    velocities = "" if recording.qd is None else f" dq={recording.called('dq')}:deg/s"
+    return f"q={recording.called('q')}:deg{velocities}"
 
 
 def _turns_on(recording: Recording, far: Bool[np.ndarray, " dof"]) -> bool:
@@ -257,11 +270,13 @@ def _velocity_unit(recording: Recording) -> None:
     for factor, cure in (
         (
             180 / np.pi,
-            "dq looks like degrees per second: multiply it by pi/180, or say --columns dq=dq_{j}:deg/s",
+            "dq looks like degrees per second: multiply it by pi/180, or say --columns"
+            f" dq={recording.called('dq')}:deg/s",
         ),
         (
             np.pi / 180,
-            "q looks like degrees beside dq in rad/s: multiply q by pi/180, or say --columns q=q_{j}:deg",
+            "q looks like degrees beside dq in rad/s: multiply q by pi/180, or say --columns"
+            f" q={recording.called('q')}:deg",
         ),
         (30 / np.pi, "dq looks like revolutions per minute: multiply it by pi/30"),
         (1e3, "dq is a thousand times d(q)/dt: check the units of time and dq"),

@@ -81,7 +81,8 @@ def _canonical(path: Path, archive: Mapping[str, np.ndarray], reading: Reading) 
         if array is not None and (what := unmeasured(array, q, False)):
             arrays[channel] = None
             notes.append(UNMEASURED.format(name=channel, what=what))
-    origin = Origin("canonical arrays", {c: c for c in CHANNELS if arrays[c] is not None}, "measured")
+    channels = {c: c for c in CHANNELS if arrays[c] is not None}
+    origin = Origin("canonical arrays", channels, "measured", columns=channels)
     rows, cut_notes = within(path.name, time, reading)
     row = lambda i: f"row {i + rows.start + 1}"
     q, qd, *torque = (None if (array := arrays[c]) is None else array[rows] for c in CHANNELS[1:])

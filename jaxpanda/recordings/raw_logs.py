@@ -78,7 +78,8 @@ def read_raw_logs(path: Path, reading: Reading) -> list[Recording]:
         if reading.episode
         else None
     )
-    origin = Origin("a folder of logs", {channel: file.name for channel, file in files.items()})
+    called = {channel: file.name for channel, file in files.items()}
+    origin = Origin("a folder of logs", called, columns=called)
     for number, (start, stop) in enumerate(itertools.pairwise(breaks), 1):
         if wanted is not None and str(number) not in wanted:
             continue

@@ -28,6 +28,8 @@ class Origin:
     torque: Torque = "unstated"
     says: str = ""
     """Of torque, in words."""
+    columns: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Of each channel, and of each joint's, what `--columns` calls it, without a unit."""
 
     def lines(self) -> list[str]:
         """For who looks at a recording."""
@@ -35,7 +37,12 @@ class Origin:
         return [f"taken for {self.source}: {took}", *([f"its source says: {self.says}"] if self.says else [])]
 
     def to_json(self) -> dict[str, Any]:
-        return {**dataclasses.asdict(self), "channels": dict(self.channels)}
+        return {
+            "source": self.source,
+            "channels": dict(self.channels),
+            "torque": self.torque,
+            "says": self.says,
+        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,6 +137,12 @@ class Recording:
         yield "time", self.time
         for name, channel in self.measured.items():
             yield from ((f"{name}_{j + 1}", channel[:, j]) for j in range(channel.shape[1]))
+
+    def called(self, channel: str) -> str:
+        """What `--columns` calls a channel, such as q, or that of one joint, such as q_2."""
+        columns = {} if self.origin is None else self.origin.columns
+        plain = channel if channel == "time" or "_" in channel else f"{channel}_{{j}}"
+        return columns.get(channel, plain)
 
     @property
     def dof(self) -> int:

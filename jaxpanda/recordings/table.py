@@ -138,11 +138,19 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
         table.path,
         dict(table.repairs()),
         (*table.notes, *notes, *cut_notes),
-        origin=Origin(_named(source, said), taken, torque, says),
+        origin=Origin(_named(source, said), taken, torque, says, _called(wanted, found, table.names)),
         tau_motor=channels["tau_motor"][rows] if "tau_motor" in channels else None,
         row=row,
     )
     return checked(recording, row)
+
+
+def _called(
+    wanted: Mapping[str, str], found: Mapping[str, Sequence[int]], names: Sequence[str]
+) -> dict[str, str]:
+    """Of each channel, and of each joint's, what `--columns` calls its columns."""
+    each = {f"{c}_{j + 1}": names[k] for c, at in found.items() for j, k in enumerate(at) if c != "time"}
+    return each | {c: split_unit(where)[0] for c, where in wanted.items() if where and c not in each}
 
 
 def unmeasured(values: Float[np.ndarray, "rows n"], q: Float[np.ndarray, "rows n"], declared: bool) -> str:
@@ -277,7 +285,8 @@ def _source(table: Table, sources: Sequence[Source], said: Mapping[str, str]) ->
     needed = [c for c in ("time", "q") if c not in said] or ["time", "q"]
     for source in sources:
         marks = [*(source.columns.get(c, "") for c in needed), *source.marks]
-        if all(_there(table.names, where) for where in marks):
+        own = [where for c, where in source.columns.items() if c != "time"]  # many logs have a time
+        if all(_there(table.names, where) for where in marks) and any(_there(table.names, w) for w in own):
             return source
     seen = {name.lower() for name in table.names}
     timed = "time" in seen or "time" in said
