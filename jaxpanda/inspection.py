@@ -440,7 +440,8 @@ def _time_verdicts(found: Inspection) -> list[str]:
         )
     if found.repeated_rows > 0.01 * found.samples:
         said.append(
-            f"{found.repeated_rows} rows repeat the one before: the logger ran faster than the controller"
+            f"{found.repeated_rows} rows repeat the one before: the logger ran faster than the controller, or the"
+            " arm stood still"
         )
     if found.period is not None:
         said.append(

@@ -183,6 +183,8 @@ class Retrieval:
         path = Path(path)
         file = path / FILE if path.is_dir() else path
         settle(file.parent)
+        if path.is_dir() and not file.exists():
+            raise InputError(f"{file}: is not there; a folder that `retrieve` wrote is needed")
         document = read_json(file)
         if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
             raise InputError(f"{file}: is no retrieval (schema '{SCHEMA}'); `retrieve` writes one")

@@ -318,6 +318,16 @@ def test_a_worker_is_replaced_when_its_memory_passes_the_limit():
     assert (api.hired, api.killed) == (3, 2)
 
 
+def test_a_model_that_is_not_there_is_told_by_its_row(resting, tmp_path):
+    table = tmp_path / "fleet.csv"
+    table.write_text(
+        f"recording,arm,model\n{resting / 'left_0.csv'},a,{resting / 'arm.xml'}\nb.csv,b,none.xml\n"
+    )
+    with pytest.raises(InputError, match=r"fleet\.csv: row 2: column model: .*none\.xml: no such file"):
+        diagnose_fleet(table, tmp_path / "o", workers=0)
+    assert not (tmp_path / "o").exists()
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

@@ -70,7 +70,13 @@ def diagnose_fleet(
     read = (
         table if isinstance(table, Table) else load_table(Path(table), None if model is None else Path(model))
     )
-    for path in dict.fromkeys(row.model for row in read.rows if row.model is not None):
+    models: dict[Path, int] = {}
+    for row in read.rows:
+        if row.model is not None:
+            models.setdefault(row.model, row.number)
+    for path, number in models.items():
+        if not path.exists() and path != Path(model or ""):
+            raise InputError(f"{read.path.name}: row {number}: column model: {path}: no such file")
         from_mjcf(path, convention.mounting)
     options = Options(knowledge, reading, convention)
     _require_place(out)

@@ -186,7 +186,7 @@ class Recording:
         if self.dof != dof:
             raise InputError(
                 f"{self.name}: {self.dof} joints (columns q_1 ... q_{self.dof}), where the model has {dof}: "
-                "give the model of the recorded arm"
+                "both must be of one arm"
             )
 
     def require_tau(self) -> Float[np.ndarray, "time dof"]:
