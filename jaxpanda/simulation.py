@@ -154,6 +154,10 @@ def random_trajectory(
     return FourierTrajectory(raw.a * scale, raw.b * scale, q0, raw.w)
 
 
+_TURNS_OVER, _SLIDES_OVER = 0.02, 0.002
+"""Speeds over which dry friction turns [rad/s, m/s]."""
+
+
 @dataclasses.dataclass(frozen=True)
 class JointFriction:
     r"""$\tau_f = f_v \dot q + f_c \tanh(\dot q / w) + f_o$, each a number for all joints or one a joint."""
@@ -164,11 +168,17 @@ class JointFriction:
     """$f_c$ [N m]"""
     offset: Float[np.ndarray, " dof"] | float = 0.0
     """$f_o$ [N m]"""
-    width: float = 0.02
-    """$w$: speed at which three quarters of the Coulomb level are reached [rad/s]."""
+    width: Float[np.ndarray, " dof"] | float | None = None
+    """$w$: speed at which three quarters of the Coulomb level are reached; None takes 0.02 rad/s, 2 mm/s of a
+    joint that slides."""
+
+    @property
+    def turns_over(self) -> Float[np.ndarray, " dof"] | float:
+        """`width`, of joints that turn where it was left open."""
+        return _TURNS_OVER if self.width is None else self.width
 
     def torque(self, qd: Float[np.ndarray, "*batch dof"]) -> Float[np.ndarray, "*batch dof"]:
-        return self.viscous * qd + self.coulomb * np.tanh(qd / self.width) + self.offset
+        return self.viscous * qd + self.coulomb * np.tanh(qd / self.turns_over) + self.offset
 
 
 @dataclasses.dataclass(frozen=True)
@@ -355,7 +365,9 @@ def _prepared(model: str | Path | mujoco.MjModel) -> mujoco.MjModel:
 
 
 def _with_frictionloss(friction: JointFriction, model: mujoco.MjModel) -> JointFriction:
-    return dataclasses.replace(friction, coulomb=friction.coulomb + model.dof_frictionloss)
+    slides = model.jnt_type[model.dof_jntid] == mujoco.mjtJoint.mjJNT_SLIDE
+    width = np.where(slides, _SLIDES_OVER, _TURNS_OVER) if friction.width is None else friction.width
+    return dataclasses.replace(friction, coulomb=friction.coulomb + model.dof_frictionloss, width=width)
 
 
 class _Tracking:
@@ -395,7 +407,7 @@ class _Tracking:
 
     def _steepest(self) -> Float[np.ndarray, " dof"]:
         """Slope of friction over velocity at rest [N m s/rad]."""
-        slope = self.friction.viscous + np.abs(self.friction.coulomb) / self.friction.width
+        slope = self.friction.viscous + np.abs(self.friction.coulomb) / self.friction.turns_over
         return np.broadcast_to(slope, self.model.nv)
 
     def stiffest(self) -> str:
