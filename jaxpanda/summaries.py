@@ -41,8 +41,9 @@ def identification(found: Any) -> Sequence[Section]:
     """Coefficients with their deviations, friction, and what is left unexplained."""
     names = found.joint_names or [f"joint {i + 1}" for i in range(found.dof)]
     unit = _unit(found.model)
+    with_friction = "" if found.friction is None else " with friction columns"
     sentences = [
-        f"{len(found.beta)} base parameters (rank {found.rank}, condition number "
+        f"{len(found.beta)} base parameters (rank {found.rank}, condition number{with_friction} "
         f"{number(found.condition_number)}) leave {number(found.relative_error_percent)} % of the data "
         "unexplained."
     ]

@@ -103,8 +103,8 @@ class Rehearsal:
         sentences = [
             f"{self.motion}, {self.seconds:.1f} s, simulated with links and friction that the analysis was not "
             f"told: {told} of {len(self.parameters)} base parameters would be known to 30 % or better (rank "
-            f"{self.rank}, condition number {number(self.condition_number)}), {self.relative_error_percent:.2g} "
-            "% of torque left.",
+            f"{self.rank}, condition number with friction columns {number(self.condition_number)}), "
+            f"{self.relative_error_percent:.2g} % of torque left.",
         ]
         if self.diagnosed is not None and (planted := self.diagnosed["planted"]):
             found = "was found" if self.diagnosed["found"] else "was not found"
