@@ -654,3 +654,12 @@ def test_a_unit_is_to_be_said_of_the_columns_that_were_read(tmp_path, columns, s
     with pytest.raises(InputError) as refused:
         load(path, columns=columns)
     assert cure in str(refused.value)
+
+
+def test_columns_without_an_order_are_to_be_named_in_that_of_the_joints(tmp_path):
+    path = tmp_path / "names.csv"
+    path.write_text("t,lift_pos,elbow_pos\n" + "".join(f"{0.01 * k},0.1,0.2\n" for k in range(200)))
+    with pytest.raises(InputError) as refused:
+        load(path, columns={"time": "t", "q": "*_pos"})
+    assert "'*_pos' (asked for as q) is lift_pos, elbow_pos" in str(refused.value)
+    assert "as q=lift_pos,elbow_pos" in str(refused.value)

@@ -126,6 +126,8 @@ def recording_of(table: Table, sources: Sequence[Source], reading: Reading) -> R
     taken = {
         name: _span([table.names[place] for place in found[name]]) for name in CHANNELS if name in channels
     }
+    if nanoseconds:
+        taken["time"] += f" + {table.names[nanoseconds[0]]}"
     _seconds(table, source, time, declared.get("time", "") if "time" not in said else "")
     rows, cut_notes = within(table.name, time, reading)
     row = lambda i: table.row(i + rows.start)
@@ -497,6 +499,12 @@ def _mapping(table: Table, channel: str, where: str) -> dict[str, str]:
         factor_of(channel, where)
         plain = split_unit(where)[0]
     columns = _expand(table.names, plain)
+    alike = re.escape(plain).replace(r"\*", ".*")
+    if not columns and (several := [name for name in table.names if re.fullmatch(alike, name)]):
+        raise InputError(
+            f"{table.name}: {plain!r} (asked for as {channel}) is {_listed(several)}, whose order it does not"
+            f" say: name them in that of the joints, as {channel}={','.join(several[:_SHOWN])}"
+        )
     if not columns:
         raise InputError(
             f"{table.name}: no column {plain!r} (asked for as {channel}); it has {listed(table.names)}"
