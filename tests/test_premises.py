@@ -8,6 +8,7 @@ import pytest
 from jaxpanda import Arm, diagnose
 from jaxpanda.arms.export import panda_mjcf
 from jaxpanda.diagnosis import diagnosis
+from jaxpanda.diagnosis.correction import Correction
 from jaxpanda.effects.sensing import TorqueOffset
 from jaxpanda.inference.problem import Problem
 from jaxpanda.inference.state import start, with_terms
@@ -55,10 +56,8 @@ def test_what_healthy_recordings_show_is_predicted_where_it_comes_again(monkeypa
     monkeypatch.setattr(premises, "_wider", lambda *_: None)
     found, state = premises.settled(tuple(made), (True, False), "exact", [])
     assert found.lasting == (comes_again,)
-    corrected = diagnosis._corrected(
-        Arm.panda(), found, found.background if comes_again else (), state, refitted=True
-    )
-    assert len(corrected.effects) == comes_again
+    lasting = found.background if comes_again else ()
+    assert len(Correction(Arm.panda(), found, state, lasting, moved=True).model.effects) == comes_again
 
 
 @pytest.mark.parametrize("further", [False, True])
