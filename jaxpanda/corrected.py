@@ -29,7 +29,7 @@ from .effects import (
     smooth_torque,
 )
 from .errors import InputError, reason
-from .inputs import read_json
+from .inputs import read_json, require_written
 from .recordings import Recording
 
 SCHEMA = "jaxpanda.corrected/1"
@@ -352,8 +352,7 @@ def _document(folder: str | Path) -> tuple[Mapping[str, Any], Path]:
     """What `diagnose` saved of the corrected arm in a folder, and where."""
     path = Path(folder) / FILE
     files.settle(folder)
-    if not path.exists():
-        raise InputError(f"{path}: is not there; a folder that `diagnose` wrote is needed")
+    require_written(path, "diagnose")
     document = read_json(path)
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise InputError(f"{path}: is no corrected model; a folder that `diagnose` wrote is needed")

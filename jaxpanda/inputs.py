@@ -133,6 +133,12 @@ def read_bytes(path: str | Path, most: int = BYTES, where: str = "") -> bytes:
     return content
 
 
+def require_written(path: Path, command: str) -> None:
+    """Refuse a file that a command writes into its folder, where it is not there."""
+    if not path.exists():
+        raise InputError(f"{path}: is not there; a folder that `{command}` wrote is needed")
+
+
 def _opened(path: Path, most: int, where: str) -> int:
     where = where or f"{path}:"
     try:

@@ -31,7 +31,7 @@ from .identification.condensed import Condensed, Evidence, linear_names, own_par
 from .identification.one_step import Prior
 from .identification.result import known_physics
 from .identification.statistics import samples_as_one
-from .inputs import read_json, read_npz
+from .inputs import read_json, read_npz, require_written
 from .parameters import coefficient_matrix
 from .posterior import FILE as POSTERIOR_FILE
 from .posterior import Posterior, named
@@ -183,8 +183,8 @@ class Retrieval:
         path = Path(path)
         file = path / FILE if path.is_dir() else path
         settle(file.parent)
-        if path.is_dir() and not file.exists():
-            raise InputError(f"{file}: is not there; a folder that `retrieve` wrote is needed")
+        if path.is_dir():
+            require_written(file, "retrieve")
         document = read_json(file)
         if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
             raise InputError(f"{file}: is no retrieval (schema '{SCHEMA}'); `retrieve` writes one")

@@ -6,6 +6,7 @@ from pathlib import Path
 from ..corrected import FILE as CORRECTED
 from ..errors import InputError
 from ..files import output_folder
+from ..inputs import require_written
 from ..retrieval import FILE as RETRIEVAL
 from ..retrieval import Retrieval
 from ..session import progress
@@ -32,10 +33,10 @@ def ensemble_files(
         raise InputError(f"--mjcf {mjcf}: from 0 to as many as there are members ({count})")
     if sweeps < 1:
         raise InputError(f"--sweeps {sweeps}: at least 1 is needed")
-    wanted = RETRIEVAL if retrieval is not None else CORRECTED
-    if not (folder / wanted).is_file():
-        command = "retrieve" if retrieval is not None else "diagnose"
-        raise InputError(f"{folder / wanted}: is not there; a folder that `{command}` wrote is needed")
+    if retrieval is not None:
+        require_written(folder / RETRIEVAL, "retrieve")
+    else:
+        require_written(folder / CORRECTED, "diagnose")
     with output_folder(out, KIND) as scratch, progress("drawing") as tick:
         source = folder if retrieval is None else Retrieval.load(folder)
         found = draw_ensemble(source, count=count, seed=seed, sweeps=sweeps, progress=tick)

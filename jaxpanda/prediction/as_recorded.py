@@ -74,8 +74,8 @@ def _turns(
     for joint in np.flatnonzero(judged):
         own = pieces[:, :, joint]
         nearest = _nearest(own)
-        if not of_arm >= PLAIN > nearest or _is_further(own, of_arm, nearest):
-            best[joint] = nearest
+        silent = of_arm >= PLAIN > nearest and not _is_further(own, of_arm, nearest)
+        best[joint] = of_arm if silent else nearest
     return tuple(ways[k] for k in best) if any(best) else ()
 
 
