@@ -744,18 +744,34 @@ def _run(arguments: list[str]) -> int:
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """SIGTERM ends a command as Ctrl-C does: what it had begun is cleared away, and that is said."""
+    """SIGTERM ends a command as Ctrl-C does: what it had begun is cleared away, and that is said.
+
+    Python drops what is raised in a destructor or a callback of its garbage collector, of which JAX has one: an
+    interrupt that falls there comes again a moment later.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    again: list[threading.Timer] = []
 
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, stop)
+    def dropped(what: Any) -> None:
+        if not issubclass(what.exc_type, KeyboardInterrupt):
+            other(what)
+            return
+        again.append(threading.Timer(0.1, signal.pthread_kill, (threading.get_ident(), signal.SIGTERM)))
+        again[-1].start()
+
+    before, other = signal.signal(signal.SIGTERM, stop), sys.unraisablehook
+    sys.unraisablehook = dropped
     try:
         yield
     finally:
+        for timer in again:
+            timer.cancel()
+        sys.unraisablehook = other
         signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
 
 

@@ -1,6 +1,7 @@
 """Inputs that nobody means, and outputs that would destroy something: one sentence each."""
 
 import dataclasses
+import gc
 import gzip
 import importlib.util
 import json
@@ -20,6 +21,7 @@ import scipy.io
 from test_commands import MODELS, refused, shaken
 
 import jaxpanda
+from jaxpanda import __main__ as entry
 from jaxpanda import report
 from jaxpanda.__main__ import main
 from jaxpanda.arms.export import write_document
@@ -215,6 +217,28 @@ def test_a_command_that_is_told_to_stop_clears_up_and_says_so(tmp_path, signal_)
     assert child.returncode == 1
     assert said == "jaxpanda: interrupted; nothing was left half-written\n"
     assert not (tmp_path / "out").exists()
+
+
+def test_a_command_that_is_told_to_stop_while_garbage_is_collected_stops(monkeypatch, capsys):
+    """A rank went on: JAX has a callback there, and Python drops what one raises."""
+
+    def during(phase, _):
+        if phase == "stop":
+            signal.raise_signal(signal.SIGTERM)
+
+    def run(_):
+        gc.callbacks.append(during)
+        try:
+            gc.collect()
+        finally:
+            gc.callbacks.remove(during)
+        time.sleep(10.0)
+        return 0
+
+    monkeypatch.setattr(entry, "_run", run)
+    assert entry.main(["inspect"]) == 1
+    assert capsys.readouterr().err == "jaxpanda: interrupted; nothing was left half-written\n"
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 NAMES = ["$x$ ^_{.csv", "a\x1b[31m\n.csv", "<b>'\"&.csv", os.fsdecode(b"\xff.csv")]
