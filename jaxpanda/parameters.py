@@ -12,7 +12,7 @@ References:
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -230,6 +230,12 @@ def expression(terms: Mapping[str, float | int]) -> str:
         text += f" {sign} " if text else "-" if coefficient < 0 else ""
         text += name if abs(coefficient) == 1 else f"{_digits(abs(coefficient))} {name}"
     return text
+
+
+def unit_of_form(terms: Iterable[str]) -> str:
+    """Of a linear form of these standard parameters: coefficients hold the lengths that the others lack."""
+    kinds = {_index(name) % 10 for name in terms}
+    return "kg m²" if kinds & set(_INERTIAS) else "kg" if kinds == {_M} else "kg m"
 
 
 def _digits(value: float) -> str:

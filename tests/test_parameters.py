@@ -18,6 +18,7 @@ from jaxpanda.parameters import (
     expression,
     random_regressor,
     standard_names,
+    unit_of_form,
 )
 
 
@@ -62,7 +63,12 @@ def test_base_parameters_do_not_depend_on_the_states_drawn():
 
 
 def test_expressions_read_as_the_paper_prints_them():
-    expressions = arm_base_parameters(Arm.panda()).expressions
+    base = arm_base_parameters(Arm.panda())
+    expressions = base.expressions
+    units = [unit_of_form(terms) for terms in base.terms]
+    assert units[:2] == ["kg m²", "kg m²"]
+    assert {unit for unit, text in zip(units, expressions, strict=True) if "J" not in text} == {"kg m"}
+    assert unit_of_form(["m1"]) == "kg"
     assert expressions[0] == "J2yy + J1zz"
     assert expressions[1] == "J2xx - J2yy + J3yy + 0.0999 m3 + 0.632 m3c3z + 0.1067 (m4 + m5 + m6 + m7)"
     assert expressions[6] == "J3xx - J3yy + J4yy - 0.0068 m4"

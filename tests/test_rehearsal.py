@@ -36,6 +36,8 @@ def test_what_is_planted_comes_back_within_its_deviation(model, tmp_path, capsys
     document = json.loads(capsys.readouterr().out)
     assert result(tmp_path / "out" / "rehearsal.json")["rank"] == document["rank"] == 15
     rows = document["parameters"] + document["friction"]
+    assert {row["unit"] for row in document["parameters"]} == {"kg m", "kg m²"}
+    assert document["unit"] == "N m"
     off = np.array([abs(row["mean"] - row["truth"]) / row["std"] for row in rows])
     assert np.mean(off < 3) > 0.8
     assert sum(row["told"] for row in document["parameters"]) >= 10

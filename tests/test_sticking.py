@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxpanda import Arm, Recording, diagnose, identify, retrieve, summaries, validate
+from jaxpanda import Arm, Recording, compare, diagnose, identify, retrieve, summaries, validate
 
 LEVEL, SLOPE = 8.0, 40.0
 LIFT = """<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="implicitfast"/><worldbody>
@@ -77,6 +77,8 @@ def test_tables_of_an_arm_that_turns_and_slides_name_both_units(tmp_path):
         found = identify(recording, Arm.from_mjcf(tmp_path / "lift.xml"))
         links = retrieve(found, starts=8)
         checked = validate(tmp_path / "lift.xml", [recording], in_mjx=False)
+        found.save(tmp_path / "found")
+        same = compare(tmp_path / "found", tmp_path / "found")
         tables = [
             table for one in (found, links, checked) for part in summaries.of(one) for table in part.tables
         ]
@@ -85,3 +87,6 @@ def test_tables_of_an_arm_that_turns_and_slides_name_both_units(tmp_path):
     assert "[N m s/rad or N s/m]" in told
     assert "tracking in MuJoCo, rmse [rad or m]" in told
     assert "[N m]" not in told
+    assert {p.unit for p in same.parameters if p.name == "coulomb"} == {"N", "N m"}
+    assert {p.unit for p in same.parameters if p.joint is None} <= {"kg", "kg m", "kg m²"}
+    assert same.sections()[0].tables[1].caption.endswith("noise [N m or N]")

@@ -202,7 +202,14 @@ def unit_of(turning: str, prismatic: Iterable[bool]) -> str:
     """
     slides = set(prismatic)
     sliding = turning
-    for old, new in (("(N·m)", "N"), ("N·m", "N"), ("N m", "N"), ("kg·m²", "kg"), ("rad", "m")):
+    for old, new in (
+        ("(N·m)", "N"),
+        ("N·m", "N"),
+        ("N m", "N"),
+        ("kg·m²", "kg"),
+        ("kg m²", "kg"),
+        ("rad", "m"),
+    ):
         sliding = sliding.replace(old, new)
     if slides == {False, True} and sliding != turning:
         return f"{turning} or {sliding}"

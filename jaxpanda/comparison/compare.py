@@ -27,7 +27,7 @@ from ..errors import InputError, require_x64
 from ..friction import UNITS
 from ..identification.regression import base_rows
 from ..identification.statistics import BLOCKS
-from ..parameters import arm_base_parameters
+from ..parameters import arm_base_parameters, linear_forms, unit_of_form
 from ..prediction import predict
 from ..recordings import Recording
 from ..signals import prepare
@@ -73,7 +73,7 @@ def compare(
         raise InputError(f"{a}, {b}: tell nothing in common; their recordings show different parameters")
     d, S = means[1] - means[0], covariances[0] + covariances[1]
     chi_squared, p = overall(d, S)
-    parameters = _parameters(labels, names, means, covariances, d, S, one.arm)
+    parameters = _parameters(labels, forms, names, means, covariances, d, S, one.arm)
     differ = p < LEVEL / 2 or any(row.differs for row in parameters)
     explanations = explained(d, S, forms, names, one.arm, means[0]) if differ else ()
     findings = _findings(one, other)
@@ -138,6 +138,7 @@ def holm(p: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 
 def _parameters(
     labels: Sequence[str],
+    forms: Float[np.ndarray, "base standard"],
     names: Sequence[str],
     means: Sequence[np.ndarray],
     covariances: Sequence[np.ndarray],
@@ -153,11 +154,15 @@ def _parameters(
     for i, label in enumerate((*labels, *names)):
         kind, _, joint = label.rpartition("_")
         friction = i >= len(labels)
+        if friction:
+            unit = arm.unit({**UNITS, "armature": "kg m²"}.get(kind, ""), int(joint) - 1)
+        else:
+            unit = unit_of_form(linear_forms(forms[i : i + 1])[0])
         out.append(
             Parameter(
                 name=kind if friction else label,
                 joint=int(joint) if friction else None,
-                unit=UNITS.get(kind, "kg m²" if kind == "armature" else "") if friction else "SI",
+                unit=unit,
                 a=float(means[0][i]),
                 b=float(means[1][i]),
                 std_a=float(np.sqrt(covariances[0][i, i])),
@@ -365,6 +370,7 @@ def _torque(
     noise = np.maximum(a.noise, b.noise)
     return {
         "motion": given.name,
+        "unit": arm.unit("N m"),
         "rms_difference": rms.tolist(),
         "expected_std": expected,
         "noise": noise.tolist(),

@@ -173,7 +173,8 @@ def sections(found: Comparison, *, page: bool = False) -> Sequence[Section]:
                 [joint, *(number(values[j], 3) for values in columns.values())]
                 for j, joint in enumerate(found.joints)
             ],
-            f"Torque on {torque['motion']}: rms difference, standard deviation expected of it, noise [N m]",
+            f"Torque on {torque['motion']}: rms difference, standard deviation expected of it, noise "
+            f"[{torque['unit']}]",
         )
     )
     matched = [(one, p) for one in found.findings for p in one["parameters"]]

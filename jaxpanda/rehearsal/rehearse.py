@@ -27,6 +27,7 @@ from ..feasible.nearest import are_buildable
 from ..identification import identify
 from ..identification.result import RELIABLE
 from ..inference.state import start
+from ..parameters import linear_forms, unit_of_form
 from ..recordings import Recording
 from ..rollout import engine_model
 from ..search.coverage import least_shown
@@ -114,6 +115,7 @@ def rehearse(
         motion=motion.name,
         seconds=seconds,
         arm=arm.name,
+        unit=arm.unit("N m"),
         joints=arm.joint_names,
         draws=draws,
         seed=seed,
@@ -192,10 +194,10 @@ def _rows(found: Sequence, truth: Arm, friction: JointFriction) -> list[Row]:
         raise InputError(
             "the motion shows some parameters so weakly that their number changes with the noise"
         )
-    for i, text in enumerate(first.expressions):
+    for i, (text, terms) in enumerate(zip(first.expressions, linear_forms(first.projection), strict=True)):
         values = np.array([one.beta[i] for one in found])
         std = np.array([one.std[i] for one in found])
-        rows.append(_row(text, None, "SI", float(first.projection[i] @ phi), values, std))
+        rows.append(_row(text, None, unit_of_form(terms), float(first.projection[i] @ phi), values, std))
     if first.friction is not None:
         planted = {"viscous": friction.viscous, "coulomb": friction.coulomb, "offset": friction.offset}
         units = {"viscous": "N·m·s/rad", "coulomb": "N·m", "offset": "N·m"}

@@ -53,6 +53,8 @@ class Rehearsal:
     motion: str
     seconds: float
     arm: str
+    unit: str
+    """Of torque."""
     joints: tuple[str, ...]
     draws: int
     seed: int
@@ -75,6 +77,7 @@ class Rehearsal:
             "motion": self.motion,
             "seconds": self.seconds,
             "arm": self.arm,
+            "unit": self.unit,
             "joints": list(self.joints),
             "draws": self.draws,
             "seed": self.seed,
@@ -131,7 +134,7 @@ class Rehearsal:
             Table(
                 ["effect", "least seen", "at joint", "most needed", "at joint", "never at joints"],
                 faults,
-                "Rms torque [N m] from which a fault would be seen, at its best and its worst joint",
+                f"Rms torque [{self.unit}] from which a fault would be seen, at its best and its worst joint",
             ),
         ]
         return [Section("Rehearsal", [*sentences, *self.notes], tables)]
