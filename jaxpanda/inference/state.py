@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections import defaultdict
 from collections.abc import Collection, Sequence
 
 import numpy as np
@@ -140,7 +141,7 @@ def beyond(left: Sequence[Float[np.ndarray, " _time"]], count: float, dt: float)
     best, shape = float(np.log(max(_mean_square(left, count), 1e-300))), (0.0, 0.0)
     count = max(count, 2.0)
     if best > 0 and (tried := slow_errors(dt)):
-        squares = sum(_levelled_squares(part[rows], dt) for part in left for rows in stretches(part != 0))
+        squares = _levelled_squares([part[rows] for part in left for rows in stretches(part != 0)], dt)
         found = np.log(squares / count) + 2 * np.log(count) / count
         if found.min() < best:
             best, shape = float(found.min()), tried[int(found.argmin())]
@@ -162,18 +163,32 @@ def slow_errors(dt: float) -> tuple[tuple[float, float], ...]:
     return tuple(out)
 
 
-def _levelled_squares(y: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " slow_errors"]:
-    r"""Sum of squares of `levelled` for each of `slow_errors`, which differ little from one to the next.
+def _levelled_squares(
+    each: Sequence[Float[np.ndarray, " _time"]], dt: float
+) -> Float[np.ndarray, " slow_errors"]:
+    r"""Sum of squares of `levelled` stretches for each of `slow_errors`, which differ little from each other.
 
     $\sum_t u_t^2 = \sum_k r_k c_k - e$ with r the autocorrelation of y, c that of the filter's response
-    $1, (z-p), (z-p) z, \ldots$, and e what it answers behind the stretch.
+    $1, (z-p), (z-p) z, \ldots$, and e what it answers behind the stretch. Stretches of like length go together.
     """
     longest = max(1e-9, *(zero for _, zero in slow_errors(dt)))
-    lags = min(len(y), 2 + int(np.log(np.finfo(float).eps) / np.log(longest)))  # beyond, rounding is left
-    related, behind, powers = _responses(dt, lags)
-    size = scipy.fft.next_fast_len(len(y) + lags, real=True)  # a prime takes ten times as long
-    lagged = np.fft.irfft(np.abs(np.fft.rfft(y, size)) ** 2, size)[:lags]
-    return related @ lagged - behind * (powers @ y[::-1][:lags]) ** 2
+    most = 2 + int(np.log(np.finfo(float).eps) / np.log(longest))  # lags beyond are rounding
+    alike: dict[int, list[np.ndarray]] = defaultdict(list)
+    for y in each:
+        alike[len(y).bit_length()].append(y)
+    out = np.zeros(len(slow_errors(dt)))
+    for some in alike.values():
+        count = max(map(len, some))
+        lags = min(count, most)
+        size = scipy.fft.next_fast_len(count + lags, real=True)  # a prime takes ten times as long
+        back = np.zeros((len(some), count))
+        for k, y in enumerate(some):
+            back[k, : len(y)] = y[::-1]
+        power = np.sum(np.abs(np.fft.rfft(back, size)) ** 2, 0)
+        related, behind, powers = _responses(dt, lags)
+        ends = np.sum((powers @ back[:, :lags].T) ** 2, 1)
+        out += related @ np.fft.irfft(power, size)[:lags] - behind * ends
+    return out
 
 
 @functools.lru_cache(maxsize=64)
