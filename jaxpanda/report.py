@@ -6,6 +6,7 @@ two ways to read it. The page needs no network: figures are SVG inside it.
 
 import dataclasses
 import io
+import math
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -89,6 +90,13 @@ class Section:
 def number(value: float | int | None, digits: int = 4) -> str:
     """A number as people read it; a dash where there is none."""
     return "–" if value is None else f"{value:.{digits}g}"
+
+
+def estimate(value: float, std: float | None) -> str:
+    """A number with four digits, or as many more as its deviation leaves it: of a clock of Unix, the seconds."""
+    told = value and std and math.isfinite(value) and math.isfinite(std)
+    digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(std)) if told else 0  # pyright: ignore
+    return number(value, min(max(digits, 4), 12))
 
 
 def to_terminal(sections: Sequence[Section], width: int | None = None) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .report import Figure, Section, Table, number
+from .report import Figure, Section, Table, estimate, number
 
 
 def of(result: Any) -> Sequence[Section]:
@@ -263,7 +263,13 @@ def _finding(place: int, one: Mapping[str, Any], names: Sequence[str], force: st
         rivals = ", ".join(f"{a['effect']} ({a['confidence']:.2f})" for a in one["alternatives"])
         sentences.append(f"What else it could be: {rivals}.")
     rows = [
-        [p["name"], number(p["joint"]), number(p["value"]), number(p.get("std"), 2), p["unit"]]
+        [
+            p["name"],
+            number(p["joint"]),
+            estimate(p["value"], p.get("std")),
+            number(p.get("std"), 2),
+            p["unit"],
+        ]
         for p in one["parameters"]
     ]
     tables = [Table(["parameter", "joint", "value", "std", "unit"], rows)] if rows else []

@@ -4,12 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+from test_excitation import ARM
 
+from jaxpanda.diagnosis import diagnose
 from jaxpanda.errors import InputError
 from jaxpanda.inspection import inspect
 from jaxpanda.recordings import Recording, load, save
 from jaxpanda.recordings.clock import on_clock
 from jaxpanda.signals import prepare
+from jaxpanda.simulation import Sensors, random_trajectory, simulate
 
 DOF = 4
 
@@ -161,3 +164,39 @@ def test_every_format_is_put_on_ticks_and_inspect_tells(tmp_path):
         lines = "\n".join(inspect(made).lines())
         assert "samples were uniform and their stamps were not" in lines
         assert "time is not uniform" not in lines
+
+
+def rubbed(t, qd):
+    """Friction that comes with warmth [N m]."""
+    return (0.3 + 0.8 * (1 - np.exp(-t / 6))) * np.tanh(qd / 0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effect", "added"),
+    [
+        ("friction_drift", rubbed),
+        ("torque_drift", lambda t, _: 0.8 * (1 - np.exp(-t / 6))),
+        ("external_contact", lambda t, _: 1.0 * ((t > 9) & (t < 11))),
+    ],
+)
+def test_what_changes_with_time_is_found_by_any_clock(effect, added, tmp_path):
+    """By that of Unix a contact was not seen, a drift of a sensor had no name, one of friction was constant."""
+    (tmp_path / "arm.xml").write_text(ARM)
+    trajectory = random_trajectory(ARM, 3, period=8.0)
+    sensors = Sensors(torque_noise=0.05, torque_correlation_time=0.02, velocity_noise=1e-3)
+    plain = simulate(ARM, trajectory, duration=20.0, rate=200.0, sensors=sensors, seed=3, name="run.csv")
+    tau = np.array(plain.tau)
+    tau[:, 1] += added(plain.time, plain.qd[:, 1])
+    (found,) = diagnose(
+        tmp_path / "arm.xml", [dataclasses.replace(plain, time=plain.time + 1.7e9, tau=tau)]
+    ).findings
+    assert (found.effect, found.joints) == (effect, (1,))
+    assert found.confidence > 0.5
+    if found.intervals is None:
+        (lasts,) = [p["value"] for p in found.parameters if p["name"] == "time_constant"]
+        assert lasts == pytest.approx(6.0, rel=0.1)
+    else:
+        ((start, stop),) = np.subtract(found.intervals, 1.7e9)
+        assert 8 < start < 9.1
+        assert stop == pytest.approx(11.0, abs=0.1)

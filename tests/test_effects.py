@@ -518,3 +518,13 @@ def test_a_bias_that_wandered_returns_to_its_mean_as_far_as_that_was_seen(period
     here, beyond, late = np.asarray(at(np.array([20.0, 20.0 + 1e-9, 300.0])))
     assert beyond == pytest.approx(here, abs=1e-6)
     assert late == pytest.approx(mean * 20 / (20 + period), abs=1e-3)
+    begin, before = np.asarray(at(np.array([0.0, -1e-9])))
+    assert before == pytest.approx(begin, abs=1e-6)
+    early = np.asarray(at(np.array([-280.0])))[0]  # where it came from is as little known
+    assert early == pytest.approx(late, abs=1e-3)
+    another = effect.counted_from(50.0)
+    another = dataclasses.replace(another, until=70.0)
+    moved = jax.vmap(lambda t: another.at(Channels(t, none, none, none, none, none)) @ c)
+    np.testing.assert_allclose(
+        moved(np.array([45.0, 60.0, 90.0])), at(np.array([-5.0, 10.0, 40.0])), atol=1e-9
+    )

@@ -255,6 +255,19 @@ def test_a_drift_seen_for_its_time_constant_goes_on_to_where_it_settles(drift):
     np.testing.assert_allclose(at(30.0)[0], -np.expm1(-6.0), rtol=1e-6)
 
 
+@pytest.mark.parametrize("form", ["level", "both"])
+def test_a_drift_counts_from_where_the_recordings_began_and_was_not_there_before(form):
+    """By the clock's own zero, that of Unix left nothing of it in any recording."""
+    begun = 1.7e9
+    for plain in (FrictionDrift(0, 5.0, 0.01, form), TorqueDrift(0, 5.0, "offset")):
+        later = plain.counted_from(begun)
+        at = lambda drift, t: drift.at(Channels(jnp.asarray(t), *(jnp.ones(2),) * 5))
+        for t in (0.0, 3.0, 40.0):
+            np.testing.assert_allclose(at(later, begun + t), at(plain, t), rtol=1e-6)
+        np.testing.assert_array_equal(at(later, begun - 40.0), at(later, begun))
+        assert "(t - 1700000000)" in later.equation
+
+
 RUBS = '<joint name="second" axis="0 1 0" armature="0.01" frictionloss="0.3" ref="20"'
 
 

@@ -13,7 +13,7 @@ from .. import summaries
 from ..arms.arm import Arm, joints_named
 from ..effects import AbstractEffect
 from ..inference.state import coefficients
-from ..report import Figure, Listing, Section, Table, number
+from ..report import Figure, Listing, Section, Table, estimate, number
 from ..versions import version
 from .diagnosis import NEXT_MOTION, Diagnosis
 from .finding import Finding
@@ -174,9 +174,9 @@ def _finding(found: Diagnosis, place: int, one: Finding, names: Sequence[str]) -
     tables = []
     rows = []
     for p in one.parameters:
-        ends = [number(p["value"] + side * 1.96 * p["std"]) for side in (-1, 1)]
+        ends = [estimate(p["value"] + side * 1.96 * p["std"], p["std"]) for side in (-1, 1)]
         interval = " … ".join(ends) if p["std"] else "–"
-        rows.append([p["name"], str(p["joint"] or "-"), number(p["value"]), interval, p["unit"]])
+        rows.append([p["name"], str(p["joint"] or "-"), estimate(p["value"], p["std"]), interval, p["unit"]])
     if rows:
         many = len(rows) > _MANY
         caption = f"Parameters, {len(rows)} rows" if many else ""

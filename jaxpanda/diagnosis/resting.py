@@ -37,7 +37,7 @@ from ..effects import CATALOGUE, UNNAMED, AbstractEffect, LawAtRest, Levels, Mot
 from ..errors import InputError
 from ..inference.knowledge import Knowledge, inertial_spread
 from ..recordings import Recording
-from ..report import Figure, Section, Table, number
+from ..report import Figure, Section, Table, estimate, number
 from ..traces import TRIM, Trace
 from .finding import Finding, Fit
 from .localise import ALARM
@@ -568,7 +568,13 @@ def sections(found: AtRest) -> list[Section]:
         tables = []
         if one.parameters:
             rows = [
-                [p["name"], str(p["joint"] or "-"), number(p["value"]), number(p["std"], 2), p["unit"]]
+                [
+                    p["name"],
+                    str(p["joint"] or "-"),
+                    estimate(p["value"], p["std"]),
+                    number(p["std"], 2),
+                    p["unit"],
+                ]
                 for p in one.parameters
             ]
             tables.append(Table(["parameter", "joint", "value", "deviation", "unit"], rows))

@@ -77,8 +77,8 @@ COMMON = -9.0
 """Prior of what nearly every arm has: friction of its gears, offsets of its torque sensors."""
 UNNAMED = "unknown"
 """Name, in the interface, of what has no law."""
-EVER = 1e9
-"""Seconds that no recording reaches."""
+EVER = 1e12
+"""Seconds that no clock reaches, that of Unix included."""
 
 
 class AbstractEffect(eqx.Module):
@@ -240,6 +240,10 @@ class AbstractEffect(eqx.Module):
     def period(self) -> float:
         """Of what wanders [s]; it is tried where a recording has half of it."""
         return 0.0
+
+    def counted_from(self, start: float) -> "AbstractEffect":
+        """The same in recordings that begin at `start` [s]: where a clock is zero means nothing."""
+        return self
 
     @property
     def passes(self) -> bool:
@@ -606,13 +610,20 @@ def _advance(effects, z, first, channels, dt):
     return jax.vmap(lambda effect, z: effect.advance(z, channels, dt), out_axes=(0, 1))(effects, z)
 
 
-def settling(t: Array | np.ndarray, time_constant: Array | float, until: Array | float) -> Array:
-    r"""$1 - e^{-t/T}$ of what was recorded up to `until` [s].
+def settling(
+    t: Array | np.ndarray, time_constant: Array | float, since: Array | float, until: Array | float
+) -> Array:
+    r"""$1 - e^{-(t - t_0)/T}$ of what was recorded from `since`, t₀, to `until` [s]; before that 0.
 
     Where less than T was, that is a trend whose end nobody has seen: what it came to is held.
     """
-    seen = jnp.where(time_constant > until, jnp.minimum(t, until), t)
-    return -jnp.expm1(-seen / time_constant)
+    seen = jnp.where(time_constant > until - since, jnp.minimum(t, until), t) - since
+    return -jnp.expm1(-jnp.maximum(seen, 0.0) / time_constant)
+
+
+def counted(since: float) -> str:
+    """Time since then [s], in an equation."""
+    return f"(t - {since:.12g})" if since else "t"
 
 
 def smooth_sign(qd: Array, width: Array | float) -> Array:

@@ -12,12 +12,14 @@ from jaxtyping import Array, Float
 from ..arms.arm import Arm
 from .effect import (
     COMMON,
+    EVER,
     AbstractDryFriction,
     AbstractEffect,
     AbstractInstantEffect,
     Coefficient,
     Numbers,
     Shape,
+    counted,
     settling,
     smooth_sign,
 )
@@ -400,10 +402,10 @@ class FrictionDrift(AbstractDryFriction):
     r"""Friction that changes slowly over a recording, as when a joint warms up.
 
     $$\tau_j = g(t)\,(a \tanh(\dot q_j / v_0) + b\,\dot q_j) + F_c \tanh(\dot q_j / v_0) + F_v \dot q_j, \qquad
-      g(t) = 1 - e^{-t/T}$$
+      g(t) = 1 - e^{-(t - t_0)/T}$$
 
-    After `until` [s], the end of what was recorded, it goes on as `settling` says. Form "level" has `a` and `F_c`
-    only, "slope" `b` and `F_v`, "both" all; "... extra" leaves out the constant part.
+    From `since` to `until` [s] was recorded; before and after, it goes on as `settling` says. Form "level" has a
+    and `F_c` only, "slope" `b` and `F_v`, "both" all; "... extra" leaves out the constant part.
 
     References:
         Simoni et al., Robotica 2017; Wolf and Iskandar, ICRA 2018.
@@ -421,7 +423,8 @@ class FrictionDrift(AbstractDryFriction):
     time_constant: Float[Array, ""] | float
     v0: Float[Array, ""] | float
     form: str = eqx.field(static=True)
-    until: float = 1e9
+    until: float = EVER
+    since: float = 0.0
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["FrictionDrift"]:
@@ -434,13 +437,16 @@ class FrictionDrift(AbstractDryFriction):
             for j in range(arm.dof)
         ]
 
+    def counted_from(self, start: float) -> "FrictionDrift":
+        return dataclasses.replace(self, since=start)
+
     def beyond(self, recorded: Sequence[Channels]) -> "FrictionDrift":
         return dataclasses.replace(self, until=max(float(s.t[-1]) for s in recorded))
 
     def lasting(self, c: Float[np.ndarray, " n"]) -> tuple["FrictionDrift", Float[np.ndarray, " n"]]:
-        end = float(settling(jnp.asarray(jnp.inf), self.time_constant, self.until))
+        end = float(settling(jnp.asarray(jnp.inf), self.time_constant, self.since, self.until))
         changes = np.array([k.name.endswith("_change") for k in self.coefficients])
-        return dataclasses.replace(self, time_constant=1e-6), np.where(changes, end * c, c)
+        return dataclasses.replace(self, time_constant=1e-6, since=-EVER), np.where(changes, end * c, c)
 
     @property
     def steady(self) -> tuple[AbstractDryFriction | ViscousFriction, ...]:
@@ -475,7 +481,7 @@ class FrictionDrift(AbstractDryFriction):
 
     @property
     def equation(self) -> str:
-        g = "(1 - exp(-t / time_constant))"
+        g = f"(1 - exp(-{counted(self.since)} / time_constant))"
         return (
             "tau = "
             + {
@@ -490,7 +496,7 @@ class FrictionDrift(AbstractDryFriction):
         )
 
     def _share(self, s: Channels) -> Float[Array, ""]:
-        return settling(s.t, self.time_constant, self.until)
+        return settling(s.t, self.time_constant, self.since, self.until)
 
     def levels(self, s: Channels) -> Float[Array, " n"]:
         g = self._share(s)

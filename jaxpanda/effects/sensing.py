@@ -12,7 +12,16 @@ import scipy.signal
 from jaxtyping import Array, Float
 
 from ..arms.arm import Arm
-from .effect import COMMON, AbstractArmEffect, AbstractInstantEffect, Coefficient, Shape, settling
+from .effect import (
+    COMMON,
+    EVER,
+    AbstractArmEffect,
+    AbstractInstantEffect,
+    Coefficient,
+    Shape,
+    counted,
+    settling,
+)
 from .motion import Channels, Joint, Motion
 from .still import LawAtRest, Levels
 from .twist import low_passed
@@ -103,10 +112,11 @@ class TorqueGain(AbstractInstantEffect):
 class TorqueDrift(AbstractInstantEffect):
     r"""Bias of a torque sensor that changes over time, $\tau_j = a\,g(t) + b$ with $g = 1 - e^{-t/T}$.
 
-    After `until` [s], the end of what was recorded, it goes on as `settling` says. Form "extra" is without the
-    constant; "wave" is $a\,t + b + s \sin(2\pi t/T) + c \cos(2\pi t/T)$, a bias that wanders; "wandering" adds
-    half the period to it. What wanders goes on to nobody knows where: after `until` it returns within $T/2\pi$
-    to its usual value, of which each period that was recorded tells as much as the user's model, which has none.
+    Time is counted from `since`, when the recordings began; they ended at `until` [s]. Before and after, it goes
+    on as `settling` says. Form "extra" is without the constant; "wave" is $a\,t + b + s \sin(2\pi t/T)
+    + c \cos(2\pi t/T)$, a bias that wanders; "wandering" adds half the period to it. What wanders came from and
+    goes to nobody knows where: away from the recordings it is, within $T/2\pi$, its usual value, of which each
+    period that was recorded tells as much as the user's model, which has none.
     """
 
     name: ClassVar[str] = "torque_drift"
@@ -121,7 +131,8 @@ class TorqueDrift(AbstractInstantEffect):
     joint: Joint
     time_constant: Float[Array, ""] | float
     form: str = eqx.field(static=True)
-    until: float = 1e9
+    until: float = EVER
+    since: float = 0.0
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["TorqueDrift"]:
@@ -132,6 +143,9 @@ class TorqueDrift(AbstractInstantEffect):
     @classmethod
     def while_still(cls, levels: Levels) -> Sequence[LawAtRest]:
         return [] if levels.when == "throughout" else [LawAtRest(levels.free, 0.05, told_by="sliding")]
+
+    def counted_from(self, start: float) -> "TorqueDrift":
+        return dataclasses.replace(self, since=start)
 
     def beyond(self, recorded: Sequence[Channels]) -> "TorqueDrift":
         return dataclasses.replace(self, until=max(float(s.t[-1]) for s in recorded))
@@ -155,30 +169,34 @@ class TorqueDrift(AbstractInstantEffect):
 
     @property
     def equation(self) -> str:
-        wave = "offset + trend * t + sine * sin(w t) + cosine * cos(w t)"
+        t = counted(self.since)
+        wave = f"offset + trend * {t} + sine * sin(w {t}) + cosine * cos(w {t})"
         return (
             "tau = "
             + {
-                "extra": "change * (1 - exp(-t / time_constant))",
-                "offset": "offset + change * (1 - exp(-t / time_constant))",
+                "extra": f"change * (1 - exp(-{t} / time_constant))",
+                "offset": f"offset + change * (1 - exp(-{t} / time_constant))",
                 "wave": f"{wave}, w = 2 pi / time_constant",
-                "wandering": f"{wave} + sine_2 * sin(2 w t) + cosine_2 * cos(2 w t), w = 2 pi / time_constant",
+                "wandering": f"{wave} + sine_2 * sin(2 w {t}) + cosine_2 * cos(2 w {t}),"
+                " w = 2 pi / time_constant",
             }[self.form]
         )
 
     def at(self, s: Channels) -> Float[Array, " n"]:
-        t = jnp.minimum(s.t, self.until)
+        lasted = self.until - self.since
+        t = jnp.clip(s.t - self.since, 0.0, lasted)
         one = jnp.ones_like(t)
         if self.form in ("wave", "wandering"):
             w = 2 * jnp.pi / self.time_constant
             waves = (w,) if self.form == "wave" else (w, 2 * w)
             now = [t, one, *(f(k * t) for k in waves for f in (jnp.sin, jnp.cos))]
-            ends = [k * self.until for k in waves]
+            ends = [k * lasted for k in waves]
             means = [m for x in ends for m in ((1 - jnp.cos(x)) / x, jnp.sin(x) / x)]
-            mean = jnp.stack([0.5 * self.until * one, one, *means])
-            usual = mean * self.until / (self.until + self.time_constant)
-            return usual + (jnp.stack(now) - usual) * jnp.exp(-w * jnp.maximum(s.t - self.until, 0.0))
-        g = settling(s.t, self.time_constant, self.until)
+            mean = jnp.stack([0.5 * lasted * one, one, *means])
+            usual = mean * lasted / (lasted + self.time_constant)
+            away = jnp.abs(s.t - self.since - t)
+            return usual + (jnp.stack(now) - usual) * jnp.exp(-w * away)
+        g = settling(s.t, self.time_constant, self.since, self.until)
         return jnp.stack([g] if self.form == "extra" else [g, one])
 
     def sensed(self, c, t, tau):

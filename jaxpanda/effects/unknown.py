@@ -21,6 +21,7 @@ from .effect import (
     Resistance,
     Shape,
     Sweep,
+    counted,
     sign_over_velocity,
     smooth_sign,
 )
@@ -457,6 +458,8 @@ class UnknownShaking(AbstractArmEffect):
     frequency: Float[Array, ""] | float
     now: str = eqx.field(static=True, default="")
     """Which of them `placed` was asked for."""
+    since: float = 0.0
+    """From when on t is counted [s]."""
 
     @classmethod
     def grid(cls, arm: Arm) -> Sequence["UnknownShaking"]:
@@ -469,6 +472,9 @@ class UnknownShaking(AbstractArmEffect):
     @classmethod
     def swung(cls, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         return -motion.gravity_columns
+
+    def counted_from(self, start: float) -> "UnknownShaking":
+        return dataclasses.replace(self, since=start)
 
     @property
     def recordings(self) -> tuple[str, ...]:
@@ -493,7 +499,8 @@ class UnknownShaking(AbstractArmEffect):
 
     @property
     def equation(self) -> str:
-        a = "(sine * sin(2 pi frequency t) + cosine * cos(2 pi frequency t))"
+        t = counted(self.since)
+        a = f"(sine * sin(2 pi frequency {t}) + cosine * cos(2 pi frequency {t}))"
         return f"tau = -dtau/dg(q) * {a}: a base that shakes"
 
     @property
@@ -505,13 +512,13 @@ class UnknownShaking(AbstractArmEffect):
     def over(self, motion: Motion) -> Float[np.ndarray, "time dof n"]:
         out = np.zeros((motion.samples, self.dof, len(self.coefficients)))
         if self.now:
-            angle = 2 * np.pi * float(self.frequency) * motion.time
+            angle = 2 * np.pi * float(self.frequency) * (motion.time - self.since)
             waves = (wave(angle)[:, None, None] for wave in (np.sin, np.cos))
             out[..., self._own] = np.concatenate([self.swung(motion) * wave for wave in waves], 2)
         return out
 
     def resist(self, c, arm, z, s, dt):
-        angle, own = 2 * jnp.pi * self.frequency * s.t, c[self._own]
+        angle, own = 2 * jnp.pi * self.frequency * (s.t - self.since), c[self._own]
         acceleration = jnp.sin(angle) * own[:3] + jnp.cos(angle) * own[3:]
         return Resistance(-gravity_columns(arm, jnp.asarray(s.q)) @ acceleration, jnp.zeros_like(s.q), z)
 

@@ -28,10 +28,16 @@ class Grid:
     )
     """Of what `columns` keeps."""
 
+    @property
+    def began(self) -> float:
+        """When the first of the recordings in question began [s]."""
+        on = [t for t, active in zip(self.traces, self.active, strict=True) if active]
+        return min(float(t.signals.time[0]) for t in on or self.traces)
+
     @functools.cached_property
     def library(self) -> list[Candidates]:
         """The catalogue on these recordings; zero in those of reference."""
-        return self._acting(build(self.traces, self.catalogue))
+        return self._acting(build(self.traces, self.catalogue, self.began))
 
     @functools.cached_property
     def catchalls(self) -> list[Candidates]:

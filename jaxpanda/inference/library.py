@@ -70,15 +70,17 @@ def form_of(effect: AbstractEffect) -> tuple[str, str]:
     return type(effect).__name__, str(getattr(effect, "form", ""))
 
 
-def build(traces: Sequence[Trace], catalogue: Sequence[type[AbstractEffect]]) -> list[Candidates]:
-    """The catalogue's grids on these recordings."""
+def build(
+    traces: Sequence[Trace], catalogue: Sequence[type[AbstractEffect]], began: float
+) -> list[Candidates]:
+    """The catalogue's grids on these recordings, with time counted from when they `began` [s]."""
     arm = traces[0].motion.arm
     longest = max(float(np.ptp(t.motion.time)) for t in traces)
     groups: dict[tuple, list[AbstractEffect]] = defaultdict(list)
     for effect_class in catalogue:
         for effect in effect_class.grid(arm):
             if effect.period < 2 * longest:
-                groups[form_of(effect)].append(effect)
+                groups[form_of(effect)].append(effect.counted_from(began))
     for trace in traces:  # made once, before there are threads
         trace.motion.load, trace.motion.regressor, trace.motion.mass, trace.motion.slope  # noqa: B018
     return _evaluated(traces, groups.values(), _by_joint)

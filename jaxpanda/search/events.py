@@ -99,7 +99,7 @@ def _swinging(
         score = np.sum([each[r] for r in some], 0)
         names = tuple(problem.traces[r].name for r in some)
         top = int(np.argmax(score))
-        effect = kind.swinging(problem.dof, names, float(finest[top]))
+        effect = kind.swinging(problem.dof, names, float(finest[top])).counted_from(problem.grid.began)
         deviation = np.concatenate(
             [np.interp(finest[top], found[r][0], found[r][2]) * expected for r in some]
         )
