@@ -35,6 +35,8 @@ from .recordings import Recording
 SCHEMA = "jaxpanda.corrected/1"
 FILE, XML = "corrected.json", "corrected.xml"
 """Names that `diagnose` gives to the corrected arm and to the MJCF with what MuJoCo holds of it."""
+_UNIX = 1e9
+"""Clocks that say more count from 1970 [s]."""
 KIND = files.Kind("diagnose", ("diagnosis.json", FILE, XML, "report.html"))
 
 
@@ -57,10 +59,11 @@ class Recorded:
         return cls(spans[0][0], spans[-1][1], tuple(_digest(r) for r in recordings))
 
     def after(self, motion: Recording) -> Recording:
-        """The motion; where it is another one and yet has the recordings' time, its clock is one of its own, and
-        it is taken to begin when they ended."""
+        """The motion; where it is another one and yet has the recordings' time, or either time is of Unix and the
+        other is not, its clock is one of its own, and it is taken to begin when they ended."""
         at_once = motion.time[0] < self.stop and motion.time[-1] > self.start
-        if not at_once or _digest(motion) in self.digests:
+        unlike = (motion.time[0] < _UNIX) != (self.start < _UNIX)
+        if not (at_once or unlike) or _digest(motion) in self.digests:
             return motion
         return dataclasses.replace(motion, time=motion.time - motion.time[0] + self.stop)
 

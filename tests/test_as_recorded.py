@@ -228,6 +228,11 @@ def test_a_motion_whose_clock_is_its_own_comes_after_the_recordings():
     for own in (at(20.0), at(40.0, other), at(-9.0, other)):
         assert recorded.after(own) is own
     assert Recorded.of([at(0.0), at(3.0)]) is None
+    logged, designed = Recorded.of([at(1.7e9)]), at(0.0, other)
+    assert logged is not None
+    np.testing.assert_allclose(logged.after(designed).time, first.time + logged.stop)
+    for own in (at(1.7e9 - 60), at(1.7e9 + 60)):
+        assert logged.after(own) is own
 
 
 def test_friction_goes_on_from_what_it_had_come_to_and_a_sensor_is_tared():
