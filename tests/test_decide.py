@@ -23,9 +23,10 @@ from jaxpanda.effects.friction import CoulombFriction, ViscousFriction
 from jaxpanda.effects.memory import PreslidingHysteresis
 from jaxpanda.effects.sensing import TorqueDrift, TorqueOffset
 from jaxpanda.effects.unknown import Unknown
+from jaxpanda.inference.evidence import log_bayes
 from jaxpanda.inference.state import likelier, misfit, places, start, with_terms
 from jaxpanda.search.credible import changes, is_of_time
-from jaxpanda.search.events import windows
+from jaxpanda.search.events import window_sums, windows
 from jaxpanda.search.premises import pose
 from jaxpanda.search.proposals import grids
 from jaxpanda.search.shapes import refine
@@ -575,3 +576,20 @@ def test_a_joint_far_off_its_noise_is_told_though_what_fits_there_is_not(monkeyp
     assert not found.corrected.effects
     np.testing.assert_allclose(found.fit.rmse_after, found.fit.rmse_before, rtol=0.05)
     assert any("coulomb friction at joint 4" in note for note in found.notes)
+
+
+def test_of_what_a_model_explains_more_than_a_window_lets_pass_nothing_is_left():
+    """Evidence of such windows was no number: no event of the recording was weighed then."""
+    F = np.random.default_rng(0).normal(size=(8, 4, 3))
+    G = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(np.swapaxes(F, 1, 2) @ F, 0)])
+    root = np.sqrt(1.2) * np.linalg.cholesky(G[5] - G[1]).T  # explains 1.2 times the first window
+    root[1:] = 0.0
+    C = np.concatenate([np.repeat(np.zeros((1, 3, 3)), 5, 0), np.repeat(root[None], 4, 0)])
+    b, pairs = np.zeros((9, 3)), np.array([[1, 5], [5, 8]])
+    _, left = window_sums((b, G, C), pairs, np.full(9, 0.9))
+    values = np.linalg.eigvalsh(left)
+    assert values[0, 0] == pytest.approx(0.0, abs=1e-9)
+    assert np.all(values[0, 1:] > 0)
+    np.testing.assert_allclose(left[1], 0.9 * (G[8] - G[5]))
+    found, _ = log_bayes(b[:2], left, np.full((2, 3), 100.0), (1e3,), np.array([1.0, 0.0, 0.0]))
+    assert np.isfinite(found).all()

@@ -201,7 +201,7 @@ def _windows(problem: Problem, design: Design, noise: Noise) -> Iterator[Proposa
             for effect in forms:
                 when = spans[effect.ends]
                 if len(when):
-                    sums = _window_sums((b[:, here], G, C[:, :, here]), when, passed)
+                    sums = window_sums((b[:, here], G, C[:, :, here]), when, passed)
                     yield _event(effect, *sums, stops, when)
 
 
@@ -246,17 +246,22 @@ def _binned(
     return b, kept["grams"], products
 
 
-def _window_sums(sums, pairs, passed):
+def window_sums(sums, pairs, passed):
     """b and G in windows. `passed`, of the power of a window of so many bins, where errors are slow, is that of a
-    constant force: where one that changes passes more, all of it counts."""
+    constant force: where one that changes passes more, all of it counts. Of one that is sharp more than all may
+    pass, and be explained: of that nothing is left."""
     b, G, C = (x[pairs[:, 1]] - x[pairs[:, 0]] for x in sums)
     explained = np.matmul(np.swapaxes(C, 1, 2), C)
     if passed is None:
         return b, G - explained
     left = G * passed[pairs[:, 1] - pairs[:, 0], None, None] - explained
-    unit = 1 / np.sqrt(np.maximum(np.diagonal(G, axis1=1, axis2=2), 1e-300))
-    least = np.linalg.eigvalsh(unit[:, :, None] * left * unit[:, None, :])[:, 0]
-    return b, np.where((least < _SOME)[:, None, None], G - explained, left)
+    size = np.sqrt(np.maximum(np.diagonal(G, axis1=1, axis2=2), 1e-300))
+    scale = size[:, :, None] * size[:, None, :]
+    more = np.linalg.eigvalsh(left / scale)[:, 0] < _SOME
+    values, vectors = np.linalg.eigh((G - explained)[more] / scale[more])
+    positive = vectors * np.maximum(values, 0.0)[:, None, :] @ np.swapaxes(vectors, 1, 2)
+    left[more] = positive * scale[more]
+    return b, left
 
 
 def _turned_back(
