@@ -48,6 +48,7 @@ from .arms.model_file import Model
 from .arms.source import file_with, from_mjcf
 from .corrected import XML, Corrected, Plant, read
 from .effects import AbstractEffect, masses, slopes
+from .effects.effect import EVER
 from .errors import InputError, require_x64
 from .recordings import Recording
 from .recordings import load as load_recording
@@ -299,7 +300,7 @@ def make_task(recording: Recording, timestep: float, plant: Plant, seconds: floa
 def _begin(plant: Plant, seconds: float) -> float:
     """Start of a window in which what happened in the recording happens [s]."""
     edges = [float(v) for e, _ in plant.laws if e.is_event for v in (e.start, e.stop)]  # pyright: ignore
-    edges = [v for v in edges if np.isfinite(v) and abs(v) < 1e8]
+    edges = [v for v in edges if np.isfinite(v) and abs(v) < EVER]
     return 0.5 * (min(edges) + max(edges)) - 0.5 * seconds if edges else -np.inf
 
 

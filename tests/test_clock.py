@@ -11,6 +11,7 @@ from jaxpanda.errors import InputError
 from jaxpanda.inspection import inspect
 from jaxpanda.recordings import Recording, load, save
 from jaxpanda.recordings.clock import on_clock
+from jaxpanda.rollout import compare
 from jaxpanda.signals import prepare
 from jaxpanda.simulation import Sensors, random_trajectory, simulate
 
@@ -188,9 +189,9 @@ def test_what_changes_with_time_is_found_by_any_clock(effect, added, tmp_path):
     plain = simulate(ARM, trajectory, duration=20.0, rate=200.0, sensors=sensors, seed=3, name="run.csv")
     tau = np.array(plain.tau)
     tau[:, 1] += added(plain.time, plain.qd[:, 1])
-    (found,) = diagnose(
-        tmp_path / "arm.xml", [dataclasses.replace(plain, time=plain.time + 1.7e9, tau=tau)]
-    ).findings
+    logged = dataclasses.replace(plain, time=plain.time + 1.7e9, tau=tau)
+    told = diagnose(tmp_path / "arm.xml", [logged])
+    (found,) = told.findings
     assert (found.effect, found.joints) == (effect, (1,))
     assert found.confidence > 0.5
     if found.intervals is None:
@@ -200,3 +201,5 @@ def test_what_changes_with_time_is_found_by_any_clock(effect, added, tmp_path):
         ((start, stop),) = np.subtract(found.intervals, 1.7e9)
         assert 8 < start < 9.1
         assert stop == pytest.approx(11.0, abs=0.1)
+        window = compare(told.corrected, told.source, logged)["window"]
+        assert window[0] < 1.7e9 + start < 1.7e9 + stop < window[1]

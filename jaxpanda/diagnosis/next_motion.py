@@ -412,7 +412,8 @@ def _placed(
     signs = held_sign(arm, np.concatenate(speeds), np.concatenate(bends), np.full(arm.dof, 1e-4))
     out = []
     for q, qd, qdd, sign in zip(ways, speeds, bends, np.split(signs, len(ways)), strict=True):
-        time, ends = np.arange(len(q)) * dt, min(round(TRIM / dt), len(q) // 4)
+        time = trace.signals.time[0] + np.arange(len(q)) * dt  # what drifts does as it did in the recording
+        ends = min(round(TRIM / dt), len(q) // 4)
         keep = np.arange(ends, len(q) - ends, stride)
         friction = np.asarray(arm.damping) * qd + np.asarray(arm.frictionloss) * sign
         motion = Motion(arm, time[keep], q[keep], qd[keep], qdd[keep], friction[keep])
