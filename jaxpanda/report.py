@@ -92,11 +92,12 @@ def number(value: float | int | None, digits: int = 4) -> str:
     return "–" if value is None else f"{value:.{digits}g}"
 
 
-def estimate(value: float, std: float | None) -> str:
+def estimate(value: float | None, std: float | None) -> str:
     """A number with four digits, or as many more as its deviation leaves it: of a clock of Unix, the seconds."""
-    told = value and std and math.isfinite(value) and math.isfinite(std)
-    digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(std)) if told else 0  # pyright: ignore
-    return number(value, min(max(digits, 4), 12))
+    digits = 4
+    if value and std and math.isfinite(value) and math.isfinite(std):
+        digits = max(digits, 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(std)))
+    return number(value, min(digits, 12))
 
 
 def to_terminal(sections: Sequence[Section], width: int | None = None) -> None:

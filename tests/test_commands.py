@@ -412,6 +412,23 @@ def test_a_table_wider_than_the_terminal_goes_on_below(capsys):
     assert words.count("Inertia") == 1
 
 
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (0.30064, 0.01, "0.3006"),
+        (12.3456789, 1e-5, "12.345679"),
+        (1700000010.123, 1e-3, "1700000010.12"),  # it was 1.7e+09
+        (0.0, 0.1, "0"),
+        (2.0, None, "2"),
+        (None, None, "–"),
+    ],
+)
+def test_an_estimate_has_the_digits_that_its_deviation_leaves_it(value, std, text):
+    from jaxpanda.report import estimate
+
+    assert estimate(value, std) == text
+
+
 def test_long_names_of_rows_give_way_to_their_numbers(capsys):
     from jaxpanda.report import Section, Table, to_terminal
 
